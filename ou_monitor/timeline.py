@@ -33,8 +33,10 @@ from ou_monitor.errors import InputError
 from ou_monitor.records import (
     as_numbers, Counters, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, NAN, Note,
     Recording)
-from ou_monitor.text import counted
+from ou_monitor.text import counted, percent
 
+# Minimum pause, in median steps.
+GAP_STEPS = 20.0
 # Share of gaps that may differ from the pattern, because of lost samples or a late logger.
 _ODD = 0.05
 # Largest deviation of a gap from the pattern, in periods: 7..13 for a period of 10.
@@ -273,6 +275,15 @@ def reading_times(t: FloatArray, period: float) -> FloatArray:
     return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t
 
 
+def scatter_words(t: FloatArray, least: float) -> str:
+    """Return a note on steps between stamps, s, that scatter; empty if by less than `least`."""
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    scatter = float(np.sqrt(np.mean((steps[steps <= GAP_STEPS * usual] / usual - 1.0) ** 2)))
+    return (f'The steps between stamps scatter by {percent(scatter)} of their median '
+            f'({1e3 * usual:.3g} ms)') * (scatter > least)
+
+
 def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
     """Return the even grid nearest to stamps (t in s, number of steps between them, result s)."""
     k = np.concatenate(([0.0], np.cumsum(number)))
@@ -288,11 +299,16 @@ def readings_of(recording: Recording) -> Recording:
     if period <= 1.0:
         return recording
     t = reading_times(recording.t[places], period)
-    held = recording.n - t.size
-    logged = (recording.n - 1) / recording.duration
-    note = (f'The voltage was read at {(t.size - 1) / float(t[-1] - t[0]):.4g} Hz and logged at '
-            f'{logged:.4g} Hz: {held} repeats were left out.')
-    return replace(part_of(recording, places, note), t=t, held=recording.held + held)
+    note = repeats_words(recording.t, t)
+    return replace(part_of(recording, places, note), t=t,
+                   held=recording.held + recording.n - t.size)
+
+
+def repeats_words(logged: FloatArray, read: FloatArray) -> str:
+    """Return a note on repeats, from the stamps of all samples and of the readings, s."""
+    rates = [(t.size - 1) / float(t[-1] - t[0]) for t in (read, logged)]
+    return (f'The voltage was read at {rates[0]:.4g} Hz and logged at {rates[1]:.4g} Hz: '
+            f'{logged.size - read.size} repeats were left out.')
 
 
 def supplied(recording: Recording, at_ends: bool = False) -> Recording:

@@ -40,7 +40,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline import refreshes
+from ou_monitor.timeline import refreshes, repeats_words
 from scipy import stats
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
@@ -178,8 +178,7 @@ def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
     good = np.isfinite(t) & np.isfinite(voltage)
     at, values, period = refreshes(t[good], voltage[good])
     if period > 1.0:
-        notes.append(f'The voltage was refreshed every {period:.4g} samples: the '
-                     f'{int(good.sum()) - at.size} repeats were left out.')
+        notes.append(repeats_words(t[good], at))
         return at, values
     return t, voltage
 

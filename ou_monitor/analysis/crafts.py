@@ -144,7 +144,7 @@ def check_cells(full: float, cells: int) -> None:
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: it is '
-            f'likely {cell_count(full) or round(full / 3.7) or 1} cells (lithium)')
+            f'likely {counted(cell_count(full) or round(full / 3.7) or 1, "cell")} (lithium)')
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:

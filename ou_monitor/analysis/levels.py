@@ -17,6 +17,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray, NAN
+from ou_monitor.timeline import GAP_STEPS
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -43,8 +44,6 @@ MAX_LEVELS = 20  # Maximum number of levels
 # A passage through a level: maximum duration, s; minimum difference between the means of its first
 # and last quarter, as a share of its range (0.75 for a ramp) and as a share of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
-# Minimum pause that splits a segment, in median steps.
-GAP_STEPS = 20.0
 
 # Bin width of the histogram of throttle.
 _GRID = 0.0025

@@ -190,7 +190,8 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                       f'{number(2e3 * resistance.se_ohm, 2)}) after {held:.2g} s'
                       + (f', {number(1e3 * resistance.at_once_ohm)} after {AT_ONCE:g} s'
                          if resistance.at_once_ohm > 0.0 else '')
-                      + (f'; computed: {fall}' if (fall := _fall_words(found)) else '')))
+                      + (f'; times the largest current: {fall}'
+                         if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '
                       'to bypass its sensor'))

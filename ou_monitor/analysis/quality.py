@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from ou_monitor.analysis.levels import GAP_STEPS
 from ou_monitor.criticism.adc import (
-    EXAMINED, find_rails, find_step, innovation_std, usual_change)
+    EXAMINED, find_rails, find_step, innovation_std, step_words, usual_change)
 from ou_monitor.records import (
     clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
 from ou_monitor.text import counted
+from ou_monitor.timeline import GAP_STEPS, scatter_words
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -124,11 +124,9 @@ def _stamp_items(recording: Recording) -> list[QualityItem]:
             f'{counted(int(pauses.sum()), "pause")} without samples, '
             f'{float(steps[pauses].sum()):.3g} s in all, the longest '
             f'{float(steps.max()):.3g} s; no level spans a pause.')))
-    jitter = float(np.sqrt(np.mean((steps[~pauses] / median - 1.0) ** 2)))
-    if jitter > _UNEVEN:
-        items.append(QualityItem('UNEVEN_CLOCK', Severity.INFO, (
-            f'The steps between stamps scatter by {100.0 * jitter:.0f} % of their median '
-            f'({1e3 * median:.3g} ms): the spectra assume even steps.')))
+    if scatter := scatter_words(recording.t, _UNEVEN):
+        items.append(QualityItem('UNEVEN_CLOCK', Severity.INFO,
+                                 f'{scatter}: the spectra assume even steps.'))
     unknown = int(np.isnan(recording.throttle).sum())
     if unknown and recording.has_throttle:
         items.append(QualityItem('THROTTLE_UNKNOWN', Severity.INFO, (
@@ -143,9 +141,7 @@ def _sample_items(recording: Recording) -> list[QualityItem]:
         return []
     items, step, noise = [], find_step(v), innovation_std(v)
     if step > 0.0 and noise > 0.0:
-        items.append(QualityItem('ADC_STEP', Severity.INFO, (
-            f'The voltage resolution is {1e3 * step:.3g} mV ({step / noise:.2g} times the noise '
-            'between samples).')))
+        items.append(QualityItem('ADC_STEP', Severity.INFO, step_words(step, noise)))
     throttle = np.nan_to_num(recording.throttle[:EXAMINED]) if recording.has_throttle else None
     if np.isfinite(find_rails(v, step or usual_change(v), noise, throttle)).any():
         items.append(QualityItem('CLIPPED', Severity.WARNING, (

@@ -138,12 +138,13 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
             found.append('The simulated load is current, which explains the voltage better than '
                          'throttle.' if samples.throttle is not None else
                          'The simulated load is current.')
-        if math.isfinite(model.load.model.constant_level):
-            found.append('No discharge is visible, so the level is constant.')
+        falls = math.isnan(model.load.model.constant_level)
         if model.doubt > _UNSURE:
-            falls = math.isnan(model.load.model.constant_level)
-            found.append(f'The level may {"be constant" if falls else "fall"} instead: it does so '
-                         f'in {percent(model.doubt)} of the simulations.')
+            found.append('Whether the pack discharges is open: the level '
+                         f'{"is constant" if falls else "falls"} in {percent(model.doubt)} of the '
+                         'simulations.')
+        elif not falls:
+            found.append('No discharge is visible, so the level is constant.')
         return found
     if samples.current is None and samples.throttle is None:
         return ['Throttle is not recorded: only level and noise are simulated.']

@@ -142,10 +142,10 @@ class Agreement:
         """Return all numbers: name, unit, digits and band."""
         response = [('fall after rises', self.fall), ('fall left after 1 s', self.recovery)]
         return [('lowest voltage', 'V', 4, self.lowest), ('mean voltage', 'V', 4, self.mean),
-                *((f'dips below {level:.6g} V', '1/min', 3, dips)
+                *((f'dips below {round(level, 3):g} V', '1/min', 3, dips)
                   for level, dips in zip(self.levels, self.dips)),
                 *((name, 'V', 3, one) for name, one in response if one is not None),
-                ('KS distance', '', 2, self.apart),
+                ('distribution (KS distance)', '', 2, self.apart),
                 *((f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz', 'V', 3, one.rms)
                   for one in self.spectrum),
                 *([] if self.line is None else [
@@ -359,7 +359,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
         found.append(Difference(
             'dips', float(rate), of(lambda m, k=k: float(m.dips[k])),  # type: ignore[misc]
             max((_RATE - 1.0) * float(rate), chance), lambda b, level=level: (  # type: ignore
-                f'the voltage dips below {level:.6g} V {number(b.median, 2)} times a '
+                f'the voltage dips below {round(level, 3):g} V {number(b.median, 2)} times a '
                 f'minute ({_span(b, 2)}), measured {number(b.measured, 2)}')))
     if own.response.size:
         begin, later = np.searchsorted(yardstick.after, [0.0, RECOVERED]).tolist()

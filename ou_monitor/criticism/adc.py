@@ -111,6 +111,12 @@ def innovation_std(v: FloatArray) -> float:
         np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
 
 
+def step_words(step: float, noise: float) -> str:
+    """Return a note on the step of the ADC and the noise between samples, V."""
+    return (f'The voltage resolution is {1e3 * step:.3g} mV ({step / noise:.2g} times the noise '
+            'between samples).')
+
+
 def find_rails(voltage: FloatArray, step: float, noise: float,
                throttle: FloatArray | None = None) -> tuple[float, float]:
     """Return the readings at which the ADC clips, V; infinite if it does not (inputs in V)."""

@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import (
-    find_rails, find_step, innovation_std, usual_change, without_repeats)
+    find_rails, find_step, innovation_std, step_words, usual_change, without_repeats)
 from ou_monitor.criticism.readings import load_of, two_levels, usable, why_no_model
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
@@ -24,7 +24,8 @@ from ou_monitor.model.terms.shocks import outlying
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, percent
-from ou_monitor.timeline import on_grid, reading_places, reading_times
+from ou_monitor.timeline import (
+    on_grid, reading_places, reading_times, repeats_words, scatter_words)
 
 # Minimum samples of a fit.
 LEAST = 100
@@ -67,6 +68,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     exact: list[Term] = []
     # A recording made in Python may still contain the steady repeats of a logger.
     places, period = reading_places(v)
+    whole = t
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     logged = Samples(t[:_EXAMINED], v[:_EXAMINED], None)
     t, v, u, held = without_repeats(t, v, u)
@@ -75,9 +77,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if period > 1.0 or recording.held or held > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])
         exact.append(HeldSamples(fresh))
-        notes.append(f'The logger repeats its last value: the voltage was measured at '
-                     f'{fresh:.4g} Hz; {recording.held + recording.n - v.size} repeats were left '
-                     'out.')
+        if max(period, held) > 1.0:
+            notes.append(repeats_words(whole, t))
     report(0.4)
     rate = (v.size - 1) / float(t[-1] - t[0])
     which, note = choose_samples(v, rate)
@@ -138,8 +139,7 @@ def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) 
     own = math.sqrt(max(noise * noise - step * step / 6.0, 0.01 * noise * noise))
     named = step >= NAMED_STEP * own
     exact += [Quantization(step)] if named else []
-    size = f'{step / own:.2g} times the' if named else 'small relative to the'
-    notes.append(f'The ADC has steps of {1e3 * step:.3g} mV, {size} noise between samples.')
+    notes.append(step_words(step, noise))
     return step if named else 0.0
 
 
@@ -199,9 +199,8 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         notes.append(f'Stamps scatter by {1e3 * error:.3g} ms about an even grid, but the voltage '
                      'does not follow: the stamps are wrong, and the grid was used.')
         return Stamps(grid, error, tuple(notes))
-    uneven = float(step[number == 1.0].std()) / usual
-    if uneven > _SMALL:
-        notes.append(f'Steps between stamps scatter by {percent(uneven)}: kept.')
+    if uneven := scatter_words(t, _SMALL):
+        notes.append(f'{uneven}: kept.')
     return Stamps(t, 0.0, tuple(notes))
 
 

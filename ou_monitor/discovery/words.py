@@ -12,6 +12,7 @@ import math
 import re
 from typing import Any
 
+from ou_monitor.discovery.decision import CHANCE
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.model.terms.catalogue import catalogue
@@ -31,6 +32,8 @@ VAGUE = ('its error is more than ten times the gain, because the rest of the rec
          'determines its parameters.')
 NO_OTHER = 'the model cannot be fitted without it.'
 NOT_KNOWN = 'not known'
+# Text of a number whose error is too large.
+VAGUE_NUMBER = 'not determined'
 
 _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
@@ -78,9 +81,12 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
              and not (curves and isinstance(value, list))}
     long = [name for name, value in known.items()
             if isinstance(value, list) and len(value) > _LISTED]
-    found = [f'{term.label(name)} = '
-             f'{with_error(value, se.get(name), positive=term.positive(name))} {term.unit(name)}'
-             .rstrip() for name, value in known.items() if name not in long]
+    found = []
+    for name, value in known.items():
+        if name not in long:
+            shown = with_error(value, se.get(name), positive=term.positive(name))
+            found.append(f'{term.label(name)} {shown}' if shown == VAGUE_NUMBER else
+                         f'{term.label(name)} = {shown} {term.unit(name)}'.rstrip())
     found += [f'factor over {name} = ' + ', '.join(
         f'{number(factor)} at {number(at)}' for at, factor in zip(*curve))
         for name, curve in curves.items()]
@@ -99,13 +105,13 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
         return 'beyond what the recording shows'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
         if positive and is_vague(value, error):
-            return 'not determined'
+            return VAGUE_NUMBER
         half = Z95 * error
         if positive and half > value > 0.0:
             return ' to '.join(number(value * math.exp(by / value), 2) for by in (-half, half))
         digits = min(max(2 + math.floor(math.log10(max(abs(value) / half, 1.0))), 2), 6)
         return f'{number(value, digits)} +- {number(half, 2)}'
-    return number(value, 4)
+    return str(value) if isinstance(value, int) else number(value, 4)
 
 
 def is_vague(value: Any, error: Any) -> bool:
@@ -232,7 +238,8 @@ def collinear_note(inflation: float, limit: float) -> str:
 def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.nan) -> str:
     """Return the gain in a sentence, and if it is not significant, the p of a named cause."""
     named = '' if math.isnan(chance) else (
-        f' Named because it explains the whole recording better ({p_words(chance)}).')
+        f' Named because it explains the whole recording better ({p_words(chance)}).'
+        if chance <= CHANCE else ' Named because without it the OU would follow the trend.')
     if not math.isfinite(gain):
         return f'Its gain cannot be measured on this recording{f": {why}" if why else "."}{named}'
     size = f'{gain_text(gain, gain_se)} mnat per sample'

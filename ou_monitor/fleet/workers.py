@@ -270,7 +270,7 @@ class ClusterWorkers(Workers):
         return self._client.submit(function, *arguments, pure=False)
 
     def _wait(self, futures: Sequence[Any]) -> list[Any]:
-        from distributed import wait
+        from distributed import CancelledError, wait
 
         alone_since = time.monotonic()
         while True:
@@ -285,8 +285,9 @@ class ClusterWorkers(Workers):
                 elif time.monotonic() - alone_since > _PATIENCE:
                     raise InputError(f'no worker is left; {_RESUME}') from None
                 continue
-            if any(future.status == 'cancelled' for future in futures):
-                raise InputError(f'the scheduler has cancelled the work; {_RESUME}')
+            except CancelledError as error:
+                raise InputError('the scheduler was lost, or has cancelled the work; '
+                                 f'{_RESUME}') from error
             found = [future for future in futures if future.status in ('finished', 'error')]
             if found:
                 return found

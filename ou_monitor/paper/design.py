@@ -379,7 +379,7 @@ def answer(result: Design) -> str:
     ratio = result.resistance / result.network.battery_resistance
     cure = ('The mean is above the level with less than ' + (
         f'{percent(ratio)} of the resistance.' if result.assumed else
-        f'{1e3 * result.resistance:.3g} mOhm.')
+        f'{1e3 * result.resistance:.3g} mOhm of battery and leads.')
             if math.isfinite(result.resistance) else
             'The level is at or above the open-circuit voltage: check cells and battery_voltage, '
             'or lower the level.' if result.rail == 'bus' else
@@ -390,8 +390,8 @@ def answer(result: Design) -> str:
 
 def _others(result: Design) -> str:
     # A lever that already meets the target at its present value cannot help.
-    found = [f'{lever.name} {lever.words(lever.least)} {lever.unit}'.rstrip()
-             for lever in result.levers[1:]
+    found = [f'{lever.name} of {lever.words(lever.least)} {lever.unit}' if lever.unit else
+             f'{lever.words(lever.least)} {lever.name}' for lever in result.levers[1:]
              if math.isfinite(lever.least) and lever.least != lever.present]
     if found:
         return 'What would help: ' + ', or '.join(found) + '.'

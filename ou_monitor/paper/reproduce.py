@@ -195,8 +195,8 @@ def _capacitance() -> str:
     return (f'For an RC rail alpha = 1/(R C) and Var_inf = S R/(2 C) under white current noise: '
             f'both are halved by a second capacitor, sigma = sqrt(S)/C too. In a 6S network of '
             f'typical parts at 40 %, a second {1e6 * before.network.bulk_capacitance:.0f} uF in '
-            f'parallel lowers alpha from {before.alpha:.3g} to {after.alpha:.3g} 1/s and the '
-            f'standard deviation from {1e3 * math.sqrt(before.var_inf):.0f} to '
+            f'parallel lowers alpha from {number(before.alpha)} to {number(after.alpha)} 1/s and '
+            f'the standard deviation from {1e3 * math.sqrt(before.var_inf):.0f} to '
             f'{1e3 * math.sqrt(after.var_inf):.0f} mV. The advice to add low-ESR '
             'capacitance is right, because Var_inf falls; the reason given, that alpha rises, is '
             'not.')

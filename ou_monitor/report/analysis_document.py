@@ -52,8 +52,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
         Section('What to know before using these numbers', [notes(analysis)]),
         lambda: _over_time(analysis),
         *_alarms(analysis),
-        Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis),
-                                  Text(analysis.alpha_test.sentence)]),
+        Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis)]),
         Section('Load levels', _levels(analysis)),
         lambda: [Section('Sigma and alpha over time', _sliding(analysis), folded=True)],
         Section('Spectrum and distribution', [lambda: _shape(analysis), *_lines(analysis)],
@@ -249,7 +248,7 @@ def _by_throttle(analysis: Analysis) -> Part:
             f'below {millivolts(fall + 2.0 * se)}' if flown and math.isfinite(fall) else UNKNOWN,
             millivolts(rms) if flown else UNKNOWN, millivolts(still) if flown else UNKNOWN,
             chance(risk)])
-    heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady\nthrottle, mV rms',
+    heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady throttle, mV rms',
              'brown-out risk']
     # A load that is only on or off leaves most throttles unknown.
     return Table.of_known(heads, [row for row in rows if set(row[1:]) != {UNKNOWN}], left=[0])
@@ -270,19 +269,17 @@ def _alarms(analysis: Analysis) -> list[Part]:
         highest = max(one.limit_v for one in analysis.alarms) / craft.cells
         return [Text(f'{title}: none at {highest:.1f} V per cell or below would have sounded.')]
     return [Section(title, [Table(
-        ['alarm, V\nper cell', 'first at, s', 'before the\nlowest, s', 'before the\nend, s',
-         'dips', 'under 1 s', 'longest, s', 'below, s'], rows),
+        ['alarm, V\nper cell', 'first at, s', 'before the lowest, s',
+         'before the end, s', 'dips', 'under 1 s', 'longest, s', 'below, s'], rows),
         Text('Dips merge at a higher alarm: their number may fall while the time below '
              'grows.')])] if rows else []
 
 
 def _curves(analysis: Analysis) -> list[Part]:
     learned, found = analysis.by_throttle, analysis.overview.facts
-    levels = [level for level in analysis.levels if math.isfinite(level.throttle) and level.n]
     if math.isnan(found.noise.flown[0]):
         return []
     x = 100.0 * np.array(found.sag.throttle)
-    at = _column([100.0 * level.throttle for level in levels])
     answer, error = 1e3 * _column(found.sag.sag_v), 2e3 * _column(found.sag.se_v)
     sag = _empty('Sag', 'mV').band(x, np.maximum(answer - error, 0.0), answer + error, '95 %', 0)
     sag.line(x, answer, 'estimate', 0, 'thick')
@@ -293,22 +290,15 @@ def _curves(analysis: Analysis) -> list[Part]:
         noise.line(x, rms, label, colour, 'thick').markers(x, rms, '', colour)
     highest = np.nanmax(np.concatenate([[1e-6], *(curve.y for curve in noise.curves)]))
     noise.limits(y=(0.0, 1.1 * float(highest)))
-    sigma, alpha = _empty('Noise intensity \u03c3', 'V/\u221as'), _empty(
-        'Relaxation rate \u03b1', '1/s')
-    _with_estimates(sigma, at, levels, 'sigma')
     risk = _empty(f'Risk of going below {learned.voltage:g} V within {learned.horizon:g} s',
                   'probability', log=True).limits(y=(_LEAST_RISK, 2.0))
     risk.line(100.0 * learned.throttle, np.where(
         np.isfinite(learned.risk), np.maximum(learned.risk, _LEAST_RISK), np.nan), '', 1, 'thick')
     if math.isfinite(learned.budget):
         risk.mark(100.0 * learned.budget, f'budget {100.0 * learned.budget:.0f} %')
-    least, most = analysis.alpha_test.interval
-    alpha.band(np.array([0.0, 100.0]), np.full(2, least), np.full(2, most), 'all levels, 95 %', 2)
-    _with_estimates(alpha, at, levels, 'alpha')
     drawn = [Figure(plot) for plot, values in (
-        (sag, answer), (noise, noise.curves[0].y), (risk, learned.risk),
-        (sigma, [level.estimate.sigma for level in levels]),
-        (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
+        (sag, answer), (noise, noise.curves[0].y), (risk, learned.risk))
+        if np.isfinite(values).any()]
     return list(Pair.two_by_two(drawn))
 
 
@@ -321,10 +311,22 @@ def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArr
     return np.array(values, dtype=np.float64)
 
 
-def _with_estimates(plot: Plot, x: FloatArray, levels: Sequence[LevelResult], name: str) -> None:
-    low, high = _column([level.estimate.interval(name) for level in levels]).reshape(-1, 2).T
-    plot.bars(x, low, high, '', 7).markers(
-        x, _column([getattr(level.estimate, name) for level in levels]), 'load levels', 7)
+def _fits(analysis: Analysis) -> list[Part]:
+    """Return sigma and alpha over throttle, if two levels have them."""
+    levels = [level for level in analysis.levels
+              if math.isfinite(level.throttle) and level.estimate.usable]
+    if len(levels) < 2:
+        return []
+    x = _column([100.0 * level.throttle for level in levels])
+    sigma = _empty('Noise intensity \u03c3', 'V/\u221as')
+    alpha = _empty('Relaxation rate \u03b1', '1/s')
+    least, most = analysis.alpha_test.interval
+    alpha.band(np.array([0.0, 100.0]), np.full(2, least), np.full(2, most), 'all levels, 95 %', 2)
+    for plot, name in ((sigma, 'sigma'), (alpha, 'alpha')):
+        low, high = _column([level.estimate.interval(name) for level in levels]).T
+        plot.bars(x, low, high, '', 7).markers(
+            x, _column([getattr(level.estimate, name) for level in levels]), 'load levels', 7)
+    return [Pair([Figure(sigma), Figure(alpha)])]
 
 
 def _levels(analysis: Analysis) -> list[Part]:
@@ -341,6 +343,8 @@ def _levels(analysis: Analysis) -> list[Part]:
                'Vpp/Vrms', 'white, mV', 'process'], rows, left=[0, 9]),
         Table(['throttle', 'alpha, 1/s\n[95 %]', 'sigma, V/sqrt(s)\n[95 %]',
                'Var_inf, V^2\n[95 %]', 'tau, ms'], fits, left=[0]),
+        lambda: _fits(analysis),
+        Text(analysis.alpha_test.sentence),
         Text('dU = \u2212\u03b1 (U \u2212 U\u2080) dt + \u03c3 dW; \u03c4 = 1/\u03b1; '
              'Var\u221e = \u03c3\u00b2/(2\u03b1). Vpp, peak and Vrms describe the deviation from '
              'the mean of each segment.', legend=True)]

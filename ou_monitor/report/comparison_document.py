@@ -28,7 +28,7 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
                   f'fitted 0 to {number(found.fitted[1], 4)} s, ')
                + f'simulated {number(first, 4)} to {number(last, 4)} s'
                + (' with the model given' if found.fitted == _NOTHING else '')
-               + f'; {", ".join(found.model)}')
+               + f'; model: {", ".join(found.model)}')
     parts: list[Part] = [
         lambda: [Figure(_voltage(found), _VOLTAGE)],
         Table(['', 'measured', 'simulated\n[95 %]', ''], _rows(found), left=[0, 3]),
@@ -79,8 +79,10 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
-    worst = [('Largest difference', found.words)] * (found.verdict is Likeness.LOOKS_LIKE_IT)
-    return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance; rms '
+    worst = [('Largest difference', f'within chance: {found.words}')] * (
+        found.verdict is Likeness.LOOKS_LIKE_IT)
+    share = f'{number(100.0 * found.explained, 3)} %' if found.explained > 0.0 else 'none'
+    return [('Mean path', f'explains {share} of the variance; rms '
              f'error {number(1e3 * found.rmse, 3)} mV, bias {number(1e3 * found.bias, 2)} mV (in '
              f'each third: {thirds})'),
             *worst]

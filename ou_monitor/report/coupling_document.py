@@ -33,7 +33,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
                             'Where the coherence is below its limit, the gain is noise.')],
                          folded=True)],
         Section('What to know before using these numbers',
-                [Notes.of([*recording.notes, *lost, *gaps, *found.notes])])]
+                [Notes.of(dict.fromkeys([*recording.notes, *lost, *gaps, *found.notes]))])]
     return Document(f'Supply noise in {name}', subject,
                     [_answer(found, name, per), answers(seen)[0]], parts, command)
 
@@ -68,10 +68,13 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
     of_supply = found.seen and not (found.signal_leads or found.narrow)
     advice = f'coupling: {number(abs(found.gain))}' if of_supply else (
         'adapting the cutoff to sigma does not help this signal')
+    random = (', but random signs of the segments exceed that more often'
+              if not found.seen and found.coherence[peak] > found.threshold else '')
     return [*lines, ('For the filter', advice),
             ('Chance', f'{p_words(found.p_value)}; detected if below {chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
-             f'{number(found.frequency[peak])} Hz; by chance up to {number(found.threshold)}')]
+             f'{number(found.frequency[peak])} Hz; in Gaussian noise by chance up to '
+             f'{number(found.threshold)}{random}')]
 
 
 def _signal(recording: Recording, signal: tuple[FloatArray, FloatArray], name: str, unit: str
@@ -87,7 +90,7 @@ def _coherence(found: Coupling) -> Plot:
     plot.limits(ends, (0.0, 1.05 * max(found.threshold, float(found.coherence.max()))))
     plot.line(found.frequency, found.coherence, 'measured', 0)
     return plot.level(found.frequency, found.threshold,
-                      f'by chance up to {found.threshold:.2g}')
+                      f'in Gaussian noise by chance up to {found.threshold:.2g}')
 
 
 def _gain(found: Coupling, per: str) -> Plot:

@@ -32,9 +32,9 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
               probability(r.risk_ou), probability(r.risk_crossing), mark]
              for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
     name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
-    subject = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the '
-               f'bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), allowed '
-               f'risk {result.target:g} within {result.horizon:g} s')
+    subject = (f'{name} at {percent(result.throttle)} throttle: mean {present.mean:.4g} V (sag of '
+               f'the bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), '
+               f'allowed risk {result.target:g} within {result.horizon:g} s')
     answers = [answer(result)]
     if taken and result.least is not None:
         answers.append(
@@ -43,7 +43,10 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
     return Document('Which capacitance', subject, answers, [
         lambda: [Figure(_risk(result))],
         Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',
-               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),
+               'mean time', 'risk (OU)', 'risk (rate)', ''], cells, left=[9]),
+        Text('Mean time: from the mean to the first brown-out. Risk (OU): from the exact first '
+             'passage of the OU; risk (rate): from the rate at which the whole noise crosses the '
+             'level. The larger one counts.', legend=True),
         Table(['what', 'unit', 'present', 'tried', 'risk then', f'needed for {result.target:g}'],
               [[lever.name, lever.unit, lever.words(lever.present), lever.words(lever.tried),
                 probability(lever.risk), 'none' if lever.least == lever.present else

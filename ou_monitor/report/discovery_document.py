@@ -92,8 +92,8 @@ def _causes(finding: Finding) -> list[Part]:
         return [Text('No cause was named.')]
     found = cause_rows(finding.causes)
     return [
-        Table(['cause', 'what it is', 'family', 'gain,\nmnat/sample',
-               'p (fit or\ngain)', 'alternatives'],
+        Table(['cause', 'what it is', 'family', 'gain, mnat/sample',
+               'p (fit or gain)', 'alternatives'],
               [[row.label, by_load(PLAIN_NAMES.get(row.name, row.name), finding.load),
                 row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
                for row in found], left=[0, 1, 2, 5]),
@@ -159,8 +159,9 @@ def _under_load(finding: Finding) -> str:
         return ''
     factor, unit = (finding.full, ' A') if load == 'current' else (1.0, '')
     low, high = (number(factor * end, 2) + unit for end in (fall.low, fall.high))
-    found = (f'The median voltage falls by {number(fall.measured, 2)} V from {load} {low} to '
-             f'{high}, {number(fall.explained, 2)} V by the model'
+    found = (f'From the readings at {load} up to {low} to those from {high} on, the median '
+             f'voltage falls by {number(fall.measured, 2)} V, with the drift between them; '
+             f'{number(fall.explained, 2)} V by the model'
              + ('.' if fall.fits else ': trust the readings.'))
     if dips.count and dips.made is not None:
         made = (f'caused {dips.made} of the {dips.count} dips' if dips.count > 1 else

@@ -180,7 +180,8 @@ _SIGNS = {'+-': '\u00b1', ' -> ': ' \u2192 '}
 _SOFT, _LEFT = ' class="soft"', ' class="left"'
 # Symbols and units in the heads of tables.
 _SYMBOLS = {'alpha': '\u03b1', 'sigma': '\u03c3', 'tau': '\u03c4', 'Var_inf': 'Var\u221e',
-            'V/sqrt(s)': 'V/\u221as', 'V^2': 'V\u00b2', 'uF': '\u00b5F', 'Ohm': '\u03a9'}
+            'V/sqrt(s)': 'V/\u221as', 'V^2': 'V\u00b2', 'uF': '\u00b5F', 'us': '\u00b5s',
+            'Ohm': '\u03a9', 'mOhm': 'm\u03a9'}
 _SYMBOL = re.compile(r'(?<!\w)(' + '|'.join(map(re.escape, _SYMBOLS)) + r')(?!\w)')
 
 

@@ -304,17 +304,28 @@ function drawFigure(pen, figure, x, y, box, ink) {
     if (curve.shown) drawCurve(pen, curve, x, y, ink.series[curve.colour]);
   }
   pen.textAlign = 'left';
-  for (const [where, label] of figure.marks) {
+  const ends = [];
+  for (const [where, label] of [...figure.marks].sort((a, b) => a[0] - b[0])) {
     const p = x.at(where);
     if (!(p >= LEFT && p <= box.right)) continue;
     pen.strokeStyle = ink.ink;
-    pen.fillStyle = ink.soft;
     pen.setLineDash([3, 3]);
     pen.beginPath();
     pen.moveTo(p, box.top);
     pen.lineTo(p, box.bottom);
     pen.stroke();
-    pen.fillText(label, p + 4, box.top + 12);
+    // Places of the labels as in svg.py.
+    const width = pen.measureText(label).width;
+    const start = p + 4 + width <= box.right ? p + 4 : p - 4 - width;
+    const free = ends.findIndex((end) => end <= start), row = free < 0 ? ends.length : free;
+    ends[row] = start + width + 4;
+    pen.setLineDash([]);
+    pen.strokeStyle = ink.paper;
+    pen.lineWidth = 4;
+    pen.strokeText(label, start, box.top + 12 + 15 * row);
+    pen.lineWidth = 1;
+    pen.fillStyle = ink.soft;
+    pen.fillText(label, start, box.top + 12 + 15 * row);
   }
   pen.restore();
 }

@@ -273,12 +273,19 @@ class Plot:
         for curve in sorted(self.curves, key=lambda c: c.kind not in ('band', 'bars')):
             parts.append(self._draw(curve, x, y))
         parts.append('</svg>')
-        for where, label in self.marks:
+        ends: list[float] = []
+        for where, label in sorted(self.marks):
             pixel = float(x(where))
             if _LEFT <= pixel <= right:
+                # To the left of its line at the right edge, and below labels that it would cover.
+                width = _LETTER * len(label)
+                start = pixel + 4.0 if pixel + 4.0 + width <= right else pixel - 4.0 - width
+                row = next((k for k, end in enumerate(ends) if end <= start), len(ends))
+                ends[row:row + 1] = [start + width]
                 parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
-                             f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
-                             f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
+                             f'x2="{pixel:.1f}" y2="{bottom}"/><text class="marked" '
+                             f'x="{start:.1f}" y="{self._top + 12 + 15 * row}">'
+                             f'{escape(label)}</text>')
         return '\n'.join([*parts, *self._legend(), '</svg>'])
 
     @property

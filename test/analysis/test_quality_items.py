@@ -101,7 +101,7 @@ def test_pauses_and_an_uneven_clock_are_measured():
     shaken = simulated.t + np.random.default_rng(1).uniform(-1e-4, 1e-4, simulated.n)
     (item,) = listed(replace(simulated, t=shaken))
     # Two independent uniform errors of +-10 %: 0.1 sqrt(2/3) = 8 %.
-    assert item.name == 'UNEVEN_CLOCK' and ' 8 %' in item.text
+    assert item.name == 'UNEVEN_CLOCK' and ' 8.1 %' in item.text
 
 
 def test_the_samples_show_the_step_of_the_adc():

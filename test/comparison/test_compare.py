@@ -292,5 +292,5 @@ def test_numbers_outside_their_bands_are_named_beside_the_verdict():
     assert 'chance allows this' in said
     many = replace(far, dips=tuple(replace(one, measured=one.high + 1.0) for one in far.dips),
                    mean=replace(far.mean, measured=far.mean.high + 1.0))
-    assert 'only in part' in _answer(many)[0] and 'KS distance' in {
+    assert 'only in part' in _answer(many)[0] and 'distribution (KS distance)' in {
         row['measure'] for row in found.measures()}

@@ -87,7 +87,7 @@ def test_steps_are_found_and_named_where_they_matter(share, offset):
     found = examined(t, coded)
     assert names(found) == (['quantization'] if share > 0.3 else [])
     assert found.samples.n == t.size
-    assert any('ADC has steps' in note for note in found.notes)
+    assert any('voltage resolution' in note for note in found.notes)
 
 
 def test_no_lattice_in_what_is_rounded_to_text():
@@ -262,9 +262,7 @@ def test_events_that_only_neighbours_show_are_kept():
                                           (1.0, True), (2.0, True)])
 def test_a_step_is_held_against_the_noise_without_its_own_rounding(times, named):
     """Rounding adds step^2 / 12 to a sample, so step^2 / 6 to the square of an innovation."""
-    # A noise of 1 mV that was rounded is 1 mV again: steps count from 0.3 mV on, and the note
-    # gives them in units of that noise.
+    # A noise of 1 mV that was rounded is 1 mV again: steps count from 0.3 mV on.
     exact, notes = [], []
     _judge_step(1e-3 * times, 1e-3 * math.sqrt(1.0 + times**2 / 6.0), exact, notes)
     assert [term.NAME for term in exact] == ['quantization'] * named
-    assert not named or f', {times:.2g} times the noise' in notes[0]

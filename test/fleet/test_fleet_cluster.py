@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 import shutil
 import subprocess
+import threading
+import time
 
 from dask import config
 from distributed import LocalCluster
@@ -65,3 +67,14 @@ def test_no_certificate_is_one_line(scheduler):
     """Who has none gets no connection, and reads where it is described."""
     with pytest.raises(InputError, match='--scheduler: no scheduler answers.*doc/security.md'):
         ClusterWorkers(scheduler, version)
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_a_lost_scheduler_is_one_line():
+    """It goes away while a task runs; Dask's own messages on its end are no fault."""
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False,
+                      protocol='tcp://', dashboard_address=None) as cluster, \
+            ClusterWorkers(cluster.scheduler_address, version) as pool:
+        threading.Timer(1.0, cluster.close).start()
+        with pytest.raises(InputError, match='same command resumes'):
+            list(pool.each(time.sleep, [(3.0,), (3.0,)]))

@@ -88,7 +88,7 @@ def test_a_smaller_resistance_is_never_riskier():
 def test_a_fixed_esr_may_leave_no_capacitance():
     result = design(PowerNetwork(), 0.4, esr_follows=False, **QUESTION)
     assert result.verdict is DesignVerdict.OUT_OF_RANGE and result.least is None
-    assert 'What would help: packs in parallel' in answer(result)
+    assert 'What would help: 2 packs in parallel' in answer(result)
     wide = design(PowerNetwork(), 0.4, esr_follows=False, capacitances=(10e-6, 0.1), **QUESTION)
     assert 'alpha rises' in effect(wide) and not remarks(wide)
     assert 'does not always lower the risk' in remarks(replace(wide, falls=False))[0]
