@@ -24,7 +24,8 @@ def plain(text: str | None) -> str:
 
 def option(action: argparse.Action, parser: argparse.ArgumentParser) -> list[str]:
     """Return an option or an argument and its text."""
-    shown = action.metavar or (action.dest if action.nargs != 0 else '')
+    choices = f"{{{','.join(map(str, action.choices))}}}" if action.choices else ''
+    shown = action.metavar or choices or (action.dest if action.nargs != 0 else '')
     value = rf'\fI{plain(str(shown))}\fR' if action.nargs != 0 and shown else ''
     names = ', '.join(rf'\fB{plain(name)}\fR' for name in action.option_strings)
     text = (action.help or '') % {**vars(action), 'prog': parser.prog}
@@ -44,9 +45,10 @@ def page() -> str:
         for action in command._actions:
             if action.help is not argparse.SUPPRESS:
                 lines += option(action, command)
-        # Paragraphs and examples keep their lines.
-        if command.epilog:
-            lines += ['.PP', '.nf', *(plain(line) for line in command.epilog.splitlines()), '.fi']
+        # Examples keep their lines.
+        for part in (command.epilog or '').split('\n\n'):
+            lines += ['.PP', '.nf', *map(plain, part.splitlines()), '.fi'] if (
+                part.startswith('Examples:')) else ['.PP', plain(part)] if part else []
     return '\n'.join([*lines, '.SH EXIT STATUS',
                       '0, or 2 after bad input, which one line on standard error describes.', ''])
 

@@ -177,9 +177,10 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
     flights, more = number_flights(vehicles, starts)
     for path, first in twice.items():
         if vehicles[path].name != vehicles[first].name:
+            here, there = (vehicles[p].name or 'none' for p in (path, first))
             notes.append(f"'{path}' has the same content as '{first}', but its path names "
-                         f"another vehicle ('{vehicles[path].name}' instead of "
-                         f"'{vehicles[first].name}'): one of the two is in the wrong place.")
+                         f'another vehicle ({here} instead of {there}): one of the two is in the '
+                         'wrong place.')
     more += [f'{vehicles[path].name or "unknown vehicle"}: {path.name}: {note}' for path in starts
              for note in results[path]['damage']]
     for group in {v.name for v in vehicles.values()} - {''}:

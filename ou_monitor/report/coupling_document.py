@@ -15,7 +15,7 @@ from ou_monitor.text import chance, counted, number, p_words
 def coupling_document(found: Coupling, recording: Recording, signal: tuple[FloatArray, FloatArray],
                       name: str, unit: str, seen: Overview, command: str = '') -> Document:
     """Return the report of a coupling; `signal` holds stamps, s, and values."""
-    grid, per = found.grid, f'{unit} per V'.lstrip()
+    grid, per = found.grid, f'{unit or "signal units"} per V'
     subject = (f'{recording.name}, {name}: {grid.duration:.4g} s covered by both, '
                f'{found.segments:.0f} segments'
                + (', throttle removed' if found.partial else ''))

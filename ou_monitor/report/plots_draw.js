@@ -237,7 +237,7 @@ function drawCurve(pen, curve, x, y, colour) {
 // Names cut to `room` pixels each; empty if that is too little, as in svg.py.
 function placeNames(names, room) {
   const most = Math.floor(room / 7) - 1, longest = Math.max(0, ...names.map((n) => n.length));
-  if (most < Math.min(6, longest)) return [];
+  if (most < Math.min(4, longest)) return [];
   return names.map((n) => (n.length <= most ? n : `${n.slice(0, most - 1)}\u2026`));
 }
 

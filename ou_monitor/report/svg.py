@@ -25,7 +25,7 @@ _LETTER = 7.0
 # Half the width of an error bar's cap, pixels.
 _CAP = 7.0
 # Minimum characters of a shortened name.
-_SHORTEST = 6
+_SHORTEST = 4
 # Height of a row of the legend, pixels.
 _LEGEND = 18
 # Maximum magnitude of a drawn value; larger ones would overflow in the arithmetic of the axis.
