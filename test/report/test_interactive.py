@@ -308,6 +308,14 @@ def test_paper_shows_the_drawings(tab):
     assert shown(tab, 'figure > svg') == 4 and shown(tab, '.live, .live-hint') == 0
 
 
+def test_paper_shows_folded_sections(tab):
+    tab.run('document.body.insertAdjacentHTML("beforeend", '
+            "'<details class=\"section\"><summary>a</summary><p id=\"in\">b</p></details>')")
+    for kind, seen in (('screen', False), ('print', True)):
+        tab.media(kind)
+        assert tab.run('document.querySelector("#in").checkVisibility()') == seen
+
+
 def test_without_scripts_the_drawings_stay(browser, file):
     """Nothing is hidden and nothing is empty."""
     browser.send('Emulation.setScriptExecutionDisabled', value=True)

@@ -152,3 +152,15 @@ def test_a_legend_covers_no_curve(title):
     axes = next(part for part in tree if part.tag == 'svg')
     entries = [part for part in tree if part.get('class') == 'legend']
     assert len(entries) == 2 and all(float(e.get('y')) < float(axes.get('y')) for e in entries)
+
+
+def test_labels_of_marks_neither_cover_each_other_nor_leave_the_axes():
+    """Two close lines, one far from them, and one at the right edge, in any order."""
+    plot = Plot('t', 'x', 'y').line(np.array([0.0, 10.0]), np.zeros(2))
+    for at in (4.2, 9.9, 4.0, 6.0):
+        plot.mark(at, f'label {at}')
+    found = {label: (float(x), float(y)) for x, y, label in re.findall(
+        r'<text class="marked" x="([\d.]+)" y="([\d.]+)">([^<]+)<', plot.svg())}
+    first, second, far, last = (found[f'label {at}'] for at in (4.0, 4.2, 6.0, 9.9))
+    assert first[1] == far[1] == last[1] and second[1] == first[1] + 15.0
+    assert last[0] + 7.0 * len('label 9.9') < plot.width - 14
