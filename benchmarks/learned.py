@@ -47,7 +47,7 @@ def stretches(gyro: gyros.Gyro, most: int) -> Iterator[tuple[np.ndarray, np.ndar
 
 
 def ratio(t: np.ndarray, truth: np.ndarray, mode: str, rng: np.random.Generator) -> float:
-    """Return the mean square error over that of the best fixed cutoff."""
+    """Return the mean square error relative to the best fixed cutoff's."""
     rate = (t.size - 1) / float(t[-1] - t[0])
     white = min(WHITE, 0.1 * float(truth.std()))
     coupling = 0.09 * float(truth.std()) / SPREAD

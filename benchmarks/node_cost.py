@@ -5,7 +5,7 @@ CPU of the nodes per message, against nodes that only count messages or read a f
 
 All nodes listen to the same publisher at the same time, as separate processes with the same
 executor.  A busy machine affects all of them alike, so compare the ratios, not the microseconds.
-CPU time is that of the whole process from /proc, divided by the number of voltages.  The voltage
+The CPU time of the whole process, from /proc, is divided by the number of voltages.  The voltage
 is an OU rail that sags under a throttle of 50 Hz, so the estimator finds alpha, load and risk.
 """
 

@@ -7,7 +7,7 @@ A D term is the difference quotient of the gyro through the filters.  Its noise 
 part above 60 Hz (zero-phase Butterworth of order 4); its lag is the phase delay at 10 Hz of all
 filters; both over the scored part.  Each notch is followed by a low-pass whose cutoff is raised
 until both together have the lag of a Butterworth low-pass of order 2 alone; the noise is divided
-by that of the best fixed low-pass of that lag.  Low-passes are Butterworth or one, two or three
+by the noise of the best fixed low-pass of that lag.  Low-passes are Butterworth or one to three
 equal poles, whichever is best on the scored part, with and without notch.
 
 The first half of a flight is for learning; the second is scored.  `from nothing`: the whole flight
@@ -154,7 +154,7 @@ def harmonic_notch(gyro: gyros.Gyro) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(gyro: gyros.Gyro, cutoffs: tuple[float, ...]) -> Iterator[list[str]]:
-    """Yield a row per cutoff: noise over that of the best fixed low-pass with the same lag."""
+    """Yield a row per cutoff: noise relative to the best fixed low-pass with the same lag."""
     second = gyro.t > 0.5 * gyro.t[-1]
     whole = gyro.t >= 0.0
     methods: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [
@@ -215,7 +215,7 @@ HEAD = ['gyro', 'Hz', 'low-pass, Hz', 'lag, ms', "ArduPilot's notch by throttle"
 def main() -> int:
     """Measure and print the table, or put it into the page."""
     parser = arguments(__doc__, names=True)
-    parser.add_argument('--seconds', type=float, default=math.inf, help='read so much of each')
+    parser.add_argument('--seconds', type=float, default=math.inf, help='length read of each')
     parser.add_argument('--cutoffs', type=float, nargs='+', default=list(CUTOFFS))
     options = parser.parse_args()
     rows = []

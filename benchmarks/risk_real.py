@@ -4,7 +4,7 @@ The brown-out risk on recorded flights, causally, against simpler forecasts (10 
 One monitor with the default window reports at 5 Hz; the CPU time of reports includes its fits.
 Levels are those undershot in 1, 5 and 20 % of the flight's horizons, by the median of three
 samples or by single samples.  Horizons overlap: n of them count as n / (5 Hz x horizon).  Skill: 1
-minus the Brier score divided by that of the climatology so far.
+minus the Brier score divided by the climatology's score so far.
 
     OU_MONITOR_REALDATA=... python benchmarks/risk_real.py --page doc/results/risk_real.md
 """

@@ -54,7 +54,7 @@ def number_of(path: Path) -> float:
 def write_attribute(path: Path, value: object) -> None:
     """Set an attribute."""
     try:
-        # Without O_CREAT: a missing attribute is an error in a plain folder too.
+        # Without O_CREAT, so that a missing attribute is an error in an ordinary folder too.
         handle = os.open(path, os.O_WRONLY | os.O_TRUNC)
         try:
             os.write(handle, f'{value}\n'.encode('ascii', 'replace'))
@@ -247,7 +247,7 @@ class Block:
 class IioBuffer:
     """The buffer of one IIO device: its folder in sysfs, and its character device."""
 
-    # block: samples in a block (0: those of 10 ms); rate, Hz, and trigger: set unless 0 or empty.
+    # block: number of samples (0: 10 ms); rate, Hz, and trigger: set unless 0 or empty.
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
                  rate: float = 0.0, trigger: str = '') -> None:

@@ -164,7 +164,7 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     levels : tuple of float
         Further voltages, V, whose crossings are counted.
     brownout_voltage, cells
-        As for `analyze`; its crossings are counted too.
+        As for `analyze`; crossings of that voltage are counted too.
     progress : callable, optional
         Called with the share done, 0..1.
 
@@ -274,7 +274,7 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
                                   throttle=recording.throttle, band=band, level=level)
     except InputError as error:
         raise InputError(f"'{recording.name}', signal '{name}': {error}") from error
-    # The rest uses the readings without repeats, as `analyze` does.
+    # Everything else uses the readings without repeats, as `analyze` does.
     read = readings_of(recording)
     seen = overview(read, limit, cells=cells)
     return Result(
@@ -357,7 +357,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     voltage : float, optional
         Brown-out level, V; on the bus, if `cells` is given, V per cell (by default 3.3).
     cells : int
-        Cells in series; 0: those of the network, or of the recording.
+        Cells in series; 0: as in the network or the recording.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -533,7 +533,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     start, end : float, optional
         Part of the recording that `throttle` names, s.
     duration : float, optional
-        Length, s; by default the preset's length or that of the recorded throttle.
+        Length, s; by default the length of the preset or of the recorded throttle.
     rate : float, optional
         Samples per second, Hz; by default the rate of the model's recording if the model file
         states it, else the preset's rate.

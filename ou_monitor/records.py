@@ -125,7 +125,7 @@ def exp_or_inf(log: float) -> float:
 
 
 def log_interval(value: float, log_se: float, z: float = Z95) -> tuple[float, float]:
-    """Return the ends ``value * exp(-+z log_se)``; NaN when unknown, 0 and inf when open."""
+    """Return the ends ``value * exp(-+z log_se)``; 0 and inf if log_se is infinite."""
     return value * exp_or_inf(-z * log_se), value * exp_or_inf(z * log_se)
 
 
@@ -287,7 +287,7 @@ class Counters:
     resets: int = 0  # Times the window was cleared (gap, or a clock that jumped back)
 
 
-# Parameters of an estimate whose standard errors are of the logarithm.
+# Parameters of an estimate whose standard errors refer to the logarithm.
 LOG_NAMES = ('alpha', 'sigma', 'var_inf')
 
 
@@ -298,7 +298,7 @@ class Estimate:
 
     dU = -alpha (U - u0) dt + sigma dW, measured with white noise `noise_std`.
 
-    Standard errors of `alpha`, `sigma`, `var_inf` are those of the *logarithm*
+    Standard errors of `alpha`, `sigma`, `var_inf` refer to the *logarithm*
     (dimensionless, relative): the 95 % interval is
     ``alpha * exp(+-1.96 * alpha_se)``, see `interval`.  Beyond `LARGEST_LOG_SE`
     the parameter and its error are NaN, and the status says so.  `u0_se` is in volts.

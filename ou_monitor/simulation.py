@@ -34,7 +34,7 @@ from ou_monitor.text import plain_number, printable
 # Stamps (s) -> throttle 0..1.
 Profile = Callable[[FloatArray], FloatArray]
 
-# A receiver updates the throttle at this rate, Hz.
+# Rate at which a receiver updates the throttle, Hz.
 STICK_RATE = 50.0
 
 # (time s, throttle), linear between: arm, take-off, hover, two climbs
@@ -56,7 +56,7 @@ LOADS = ((0.0, 0.0), (10.0, 0.0), (10.0, 0.05), (20.0, 0.05), (20.0, 0.10), (30.
 
 def through(points: Sequence[tuple[float, float]], period: float | None = None,
             stick_rate: float | None = None) -> Profile:
-    """Return lines through points (s, 0..1); period, s, and steps at stick_rate, Hz: if given."""
+    """Return lines through points (s, 0..1), optionally periodic (s), in steps (at a rate, Hz)."""
     return partial(_through, np.array(points, dtype=np.float64).T, period, stick_rate)
 
 
@@ -93,7 +93,7 @@ PROFILES: dict[str, tuple[Profile, str]] = {
 
 
 def read_profile(text: str, columns: CsvColumns | None = None) -> Profile:
-    """Return the profile that a text describes (columns: those of a CSV)."""
+    """Return the profile that a text describes (columns: for a CSV)."""
     if text in PROFILES:
         return PROFILES[text][0]
     if text.lower().endswith('.csv') or Path(text).is_file():
@@ -159,7 +159,7 @@ class RecordedThrottle:
 
 
 def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
-    """Return whether the text for a throttle names a recording (columns: those of a CSV)."""
+    """Return whether the text for a throttle names a recording (columns: for a CSV)."""
     path = Path(text)
     if text in PROFILES or not path.exists():
         return False
@@ -401,7 +401,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
 
 
 def _rate_of(file: ModelFile, usual: float) -> float:
-    """Return the rate of the recording that a model was learned from, if its file has it, Hz."""
+    """Return the rate of the recording that a model was learned from, if stated, else `usual`."""
     rate = file.provenance.get('rate_hz')
     return float(rate) if isinstance(rate, (int, float)) and 0.0 < rate <= _RATE_MOST else usual
 

@@ -5,7 +5,7 @@ Node, estimator and offline reading share these rules:
 
 - samples with a non-finite or implausible stamp or voltage are dropped (`non_finite`);
 - an implausible throttle or current becomes NaN;
-- samples of one push are sorted; stamps not after those of earlier pushes are dropped (`late`);
+- each push is sorted; repeated stamps, and stamps before an earlier push's, are dropped (`late`);
 - a stamp that is earlier or later by more than a pause starts a new time line;
 - a reading that a logger repeats counts once (`held`).
 
@@ -72,7 +72,7 @@ class Batch:
     # shape (4, n), n > 0.
     columns: FloatArray
     shortest: float  # shortest step, s, including the step from the sample before the batch
-    longest: float  # longest step, s, including the same one
+    longest: float  # longest step, s, likewise
     restart: bool  # a new time line starts here: forget all earlier samples
     again: bool = False  # samples already passed on, now without their repeats
 
@@ -193,7 +193,7 @@ def _several_sizes(sizes: FloatArray) -> bool:
 
 
 class Repeats:
-    """Drops repeats from a stream, in batches of any size; `period`: samples per refresh."""
+    """Drops repeats from a stream, in batches of any size; `period`: samples per reading."""
 
     # A new reading may equal the previous one, and dropping it would bias the noise.  So a long
     # run of equal values counts as one reading per period, each passed on half a period later.
@@ -210,7 +210,7 @@ class Repeats:
         self._last = -math.inf
 
     def drop(self, batch: Batch) -> Batch | None:
-        """Return the refreshes among samples; None when there are none."""
+        """Return the new readings among samples; None if there are none."""
         columns = np.concatenate([self._waiting, batch.columns], axis=1)
         columns = columns[:, self.fresh(columns)]
         if not columns.size:
@@ -219,7 +219,7 @@ class Repeats:
         return Batch.of(columns, batch.restart, again=batch.again, before=before)
 
     def fresh(self, columns: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which samples are refreshes; undecided samples wait for the next call."""
+        """Return which samples are new readings; undecided samples wait for the next call."""
         y = columns[1]
         n = y.size
         starts = np.concatenate(([0], np.flatnonzero(y[1:] != y[:-1]) + 1))

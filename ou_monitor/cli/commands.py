@@ -38,7 +38,7 @@ _DIGITS = 18
 
 
 def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
-    """Return a parser of whole numbers in a range, multiples of a step; what: for its error."""
+    """Return a parser of whole numbers: low to high, multiples of step (what: for the error)."""
     def read(text: str) -> int:
         value = int(text) if text.isascii() and text.isdigit() and len(text) <= _DIGITS else -1
         if not low <= value <= high or value % step:
@@ -48,7 +48,7 @@ def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callabl
 
 
 def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
-    """Return a parser of numbers for which `fits` is true; what: wording for its error."""
+    """Return a parser of numbers for which `fits` is true (what: wording for the error)."""
     def read(text: str) -> float:
         try:
             value = plain_number(text)
@@ -239,7 +239,7 @@ class Command:
     # arguments and returns the exit status.
     module: str
     description: str  # Start of its help
-    # Options; those in a tuple exclude one another.
+    # Options; the options in a tuple exclude one another.
     options: tuple[Option | tuple[Option, ...], ...]
     examples: tuple[str, ...]  # Command lines, without ``ou-monitor`` and its name
     epilog: str = ''  # Text before the examples at the end of its help
@@ -273,7 +273,7 @@ _ANALYZE = Command(
     'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
     '95 % intervals, and the type of process.',
     (RECORDING, levels('found'), *PART,
-     *estimate('lowest permitted voltage, V (default: that of the node, 4.5)'),
+     *estimate('lowest permitted voltage, V (default: 4.5, as for the node)'),
      *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --cells 4 --report flight.html',
      'flight.mcap --brownout-voltage 14 --from 10 --to 70',

@@ -39,7 +39,7 @@ class Options:
     columns: CsvColumns | None = None
     # Whether to read the intact part of damaged bags; CSVs are always read without bad lines.
     partial: bool = False
-    discover: bool = False  # Whether to search for causes, which takes some seconds a recording
+    discover: bool = False  # Whether to search for causes: some seconds per recording
     seed: int = 0  # Seed of `discover`
 
 

@@ -14,7 +14,7 @@ normal scatter between flights (Paule and Mandel).  The scale of the t test is t
 the line, so an error common to all flights does not count.
 
 Fewer than `LEAST_VEHICLES` vehicles: each is compared with the mean of the others by a t test,
-scaled by the pooled scatter between flights; packs only with packs of as many cells.
+scaled by the pooled scatter between flights; packs only with packs of the same number of cells.
 
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
 divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between recordings, a
@@ -287,7 +287,7 @@ def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
 
 
 def _trends_of(values: Values) -> list[Trend]:
-    # Imported here because it takes a second and the workers do not need it.
+    # Imported here, because the import takes a second and the workers do not need it.
     from scipy import stats
 
     found = []

@@ -281,7 +281,7 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
     def resistance(share: float) -> float:
         if flown is None:
             return risk(replace(network, battery_resistance=share * network.battery_resistance))
-        # Less resistance cannot lower the voltage: limit an apparent rise by the level's error.
+        # Less resistance cannot raise the risk; with the error of the level it may seem to.
         return min(flown(throttle, share, 1.0), found.present.risk)
 
     def limit(share: float) -> float:

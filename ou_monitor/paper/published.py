@@ -1,7 +1,7 @@
 """
 Printed numbers of the paper, and how each is compared with its recomputation.
 
-Units are those of the paper: mV, ms, 1/s, V/sqrt(s), V^2.
+Units are as in the paper: mV, ms, 1/s, V/sqrt(s), V^2.
 """
 
 from __future__ import annotations

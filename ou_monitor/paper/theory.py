@@ -43,7 +43,7 @@ _MOST_SUBSTEPS = 32.0
 
 
 def augmented(matrix: npt.ArrayLike, offset: npt.ArrayLike) -> FloatArray:
-    """Return [[A, a], [0, 0]], whose exponential carries u and the constant 1 (matrix in 1/s)."""
+    """Return [[A, a], [0, 0]], whose exponential propagates (u, 1) (matrix in 1/s)."""
     a = np.asarray(matrix, dtype=np.float64)
     d = a.shape[-1]
     full = np.zeros((*a.shape[:-2], d + 1, d + 1))

@@ -146,10 +146,10 @@ class BagReader:
     """
     Reads a bag (.mcap file or rosbag2 directory); with `partial` also a damaged one.
 
-    By topic: message types in `topics`, numbers in `counts`, and rate of the samples within
-    blocks, Hz, in `sample_rates`, if the bag states it.  `about` is the custom data of
-    metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
-    message; `damage` the place and kind of damage, or None; `notes` topics left out, and the like.
+    By topic: `topics` has the message type, `counts` the number of messages, `sample_rates` the
+    rate of samples within blocks, Hz, if stated.  `about` is the custom data of metadata.yaml or
+    of the files; `start_ns`, `end_ns` are the log times of the first and last message; `damage` is
+    the place and kind of damage, or None; `notes` tell what was left out.
     InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
     """
 

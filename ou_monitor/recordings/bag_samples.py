@@ -300,7 +300,7 @@ def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
 
 def _limit(bag: BagReader, at: float) -> int:
     """Return a time of the recording, s, as log time, ns."""
-    # Limit times beyond the end of the bag.
+    # Clip times beyond the end of the bag.
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 
 

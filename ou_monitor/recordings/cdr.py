@@ -177,7 +177,7 @@ class Layout:
             same &= word == value
         high = np.zeros(rows.shape[0], np.uint8)
         for offset, size in self.texts:
-            # Along the messages, which are many; a text is short.
+            # Loop over the bytes of the text, which are few, not over the messages.
             for k in range(offset, offset + size):
                 high |= rows[:, k]
         same &= high < 0x80
@@ -304,7 +304,7 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
     size = np.dtype(kind).itemsize
     if not at.size:
         return np.empty(0, kind)
-    # One item at every byte: indexing such a view is far faster than combining single bytes.
+    # A view with an item at every byte: indexing it is far faster than combining single bytes.
     everywhere: npt.NDArray[Any] = np.ndarray(
         (len(data) - size + 1,), kind, data, 0, (1,))
     return everywhere[at]
@@ -440,7 +440,7 @@ class FieldReader:
         """Return the field of the messages of a table, in its order."""
         n = table.n
         stamp, beside, count = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64)
-        # Indices of messages of one layout, shape (k,), and their values, shape (k, in each).
+        # Indices of messages of one layout, shape (k,); their values, shape (k, values in each).
         blocks: list[tuple[IntArray, FloatArray]] = []
         kept, refused = np.ones(n, np.bool_), dict[int, str]()
         # A damaged message may hold a signalling NaN, of which NumPy would warn.

@@ -80,7 +80,7 @@ _BLOCK = 64 * 1024
 # Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
 # zeros.
 _MOST_RATIO = 256
-# Minimum limit of an unpacked chunk, bytes; the maximum is this fraction (1/8) of the memory.
+# Minimum of the chunk limit, bytes; number of chunks of the maximum limit that fill the memory.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 
 
@@ -311,8 +311,7 @@ class McapFile:
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
                 elif op in _UNREAD and statistics is None and not self._behind_chunk():
-                    # Without a count, a message with a damaged opcode would not be missed: check
-                    # that this is no message.
+                    # Without a count of messages, check that a damaged opcode hides none.
                     _parse(_UNREAD[op], self._content(file, length, self._limit))
                 elif op >= _PRIVATE and statistics is None and not private:
                     private = True

@@ -93,7 +93,7 @@ def _read(
     start: float | None = None, end: float | None = None, flight: int | None = None,
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, Log | None]:
-    """Read a recording, logger's repeats included; return its log too (with `signal`), if any."""
+    """Read a recording, repeats included; if it is a log, return this too, with `signal`."""
     _check_part(start, end)
     csv, log = is_csv(path), is_log(path)
     for option, value in (('msg-config', msg_config), ('voltage-topic', voltage_topic),

@@ -104,7 +104,7 @@ def write_recording(
             if values.size:
                 if '/throttle' not in bag.topics:
                     bag.add_topic('throttle', FLOAT32)
-                # One sample a period is written even if unchanged.
+                # One sample per period is written even if unchanged.
                 periods = times // THROTTLE_PERIOD_NS
                 sent = (np.diff(values, prepend=np.float32(held)) != 0.0) | (
                     np.diff(periods, prepend=period) > 0)
@@ -213,7 +213,7 @@ def _messages(place: int, kind: str, stamps: Stamps, one: Series | Motion) -> It
 
 
 def encode(kind: str, stamps: Stamps, values: FloatArray) -> Iterator[tuple[int, bytes]]:
-    """Yield messages of numbers with their log times, ns (a block's: its last sample's)."""
+    """Yield messages of numbers with their log times, ns (of a block: of its last sample)."""
     if kind == FLOAT32_ARRAY:
         whole = stamps.size - stamps.size % BLOCK
         yield from zip(stamps[BLOCK - 1:whole:BLOCK].tolist(),

@@ -403,7 +403,7 @@ def _lines(analysis: Analysis) -> list[Part]:
 
 
 def voltage_plot(recording: Recording, limit: float) -> Plot:
-    """Return the voltage, with its limit, V."""
+    """Return the plot of the voltage, with its limit, V."""
     plot = _over(recording, 'Voltage', 'V', 230)
     plot.line(_since_start(recording, recording.t), recording.voltage, colour=0)
     if math.isfinite(limit):

@@ -16,7 +16,7 @@ _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale 
             'simulation. Dashed lines: levels below which dips are counted.')
 # Fitted range that stands for a given model.
 _NOTHING = (0.0, 0.0)
-# Numbers outside their 95 % bands that are too many: of 12, 2 % of good simulations have as many.
+# Count of numbers outside their 95 % bands that only 2 % of good simulations reach (of 12).
 _TOO_MANY = 3
 
 

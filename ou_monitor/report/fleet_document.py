@@ -28,7 +28,7 @@ _UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s
 _DRAWN, _LIKELY = 8, 2
 # Maximum trends listed, the most likely ones.
 _MOST = 30
-# Maximum recordings in the table of the lowest voltages; rows and sentences on a terminal.
+# Maximum recordings in the table of lowest voltages; maximum rows or sentences on a terminal.
 _WORST, _SHOWN = 12, 10
 # Maximum recordings listed on the page; JSON and the Parquet table have all.
 _RECORDINGS = 500
@@ -238,7 +238,7 @@ def failure_words(fleet: Fleet) -> list[str]:
     found = []
     for row in fleet.failed:
         error = str(row['error']).removeprefix(row['path'])
-        # The rest may name a line of the file, or a file within it.
+        # The error may continue with a line of the file, or with a file in the folder.
         if not re.match(r':\d+:|/', error):
             error = f": {error.lstrip(': ')}"
         found.append(_prefix(row) + row['path'] + error)
@@ -555,7 +555,7 @@ def _cell(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
 
 
 def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
-    """Return the lowest voltage of each recording over the vehicles, and the limit."""
+    """Return the plot of the lowest voltages by vehicle, with the limit."""
     names = [*fleet.vehicles, *(['unknown'] if any(row['vehicle'] is None for row in rows)
                                 else [])]
     under = np.array([bool(row['dips']) for row in rows])

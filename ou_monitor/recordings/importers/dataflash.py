@@ -330,7 +330,7 @@ def _throttle_scale(values: FloatArray) -> float:
 
 
 def _outputs(table: Table, parameters: dict[str, float]) -> Iterator[Series]:
-    """Yield the mean of the motors, which the parameters name, and each output."""
+    """Yield the mean of the outputs that the parameters name as motors, and each output."""
     found: dict[int, tuple[Series, bool]] = {}
     for (kind, _), columns in table.items():
         if kind not in OUTPUTS:

@@ -185,7 +185,7 @@ def import_log(path: Path, request: Request) -> Log:
     # Damaged bytes may give numbers that overflow (ignored) and any exception (caught by `quiet`).
     with np.errstate(all='ignore'), quiet(path, form.package or 'ou_monitor'):
         log: Log = module.read(path, request)
-    # Names in a log reach messages, tables and bags.
+    # Make names printable: they reach messages, tables and bags.
     return replace(
         log, series=tuple(replace(one, name=printable(one.name, 200), words=printable(one.words),
                                   scale=printable(one.scale), own_unit=printable(one.own_unit))
@@ -197,7 +197,7 @@ def import_log(path: Path, request: Request) -> Log:
 
 
 def _terminal_progress(progress: Progress) -> Progress:
-    """Return a progress that reaches the terminal while the output of parsers is suppressed."""
+    """Return a function that shows progress while the output of parsers is suppressed."""
     terminal = sys.stderr
 
     def show(share: float) -> None:

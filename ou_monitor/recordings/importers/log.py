@@ -190,7 +190,7 @@ class CsvColumns:
     time: str | None = None
     voltage: str | None = None
     throttle: str | None = None
-    # Units: V or mV; s, ms, us or ns; 1, % or us.
+    # Units: V or mV; s, ms, us or ns; 1, %, us or the ends LOW:HIGH.
     unit: str | None = None
     time_unit: str | None = None
     throttle_unit: str | None = None
@@ -309,7 +309,7 @@ def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: It
 
 
 def started(unix: float) -> dict[str, str]:
-    """Return the fact that a log began at a Unix time, s, if its clock has a date."""
+    """Return the fact `started` for a Unix time, s; empty if it is not a date."""
     return {'started': datetime.fromtimestamp(unix, timezone.utc).isoformat(
         timespec='seconds')} if clock_unit(unix) == 's' else {}
 
@@ -348,7 +348,7 @@ def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
 
 @contextmanager
 def quiet_process() -> Iterator[None]:
-    """Discard the process's standard error, which parsers in C write past Python's."""
+    """Discard standard error by its file descriptor, to which parsers in C write directly."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)

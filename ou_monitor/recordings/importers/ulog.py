@@ -71,7 +71,7 @@ class _WatchedFile(io.BufferedReader):
     """A file that records which bytes pyulog skips silently, and avoids two faults of pyulog."""
 
     # First, an endless loop: pyulog steps back by the stated length of a message even if the file
-    # ended within it.  Second, it reads the rest of the file at each byte of a damaged part.
+    # ended within it.  Second, it rereads the rest of the file at each byte of a damaged part.
 
     progress: Progress | None = None
     size = 1
@@ -130,7 +130,7 @@ def read(path: Path, request: Request) -> Log:
     if ulog.file_corruption or file.unknown_at is not None or said.getvalue():
         where = '' if file.unknown_at is None else f' from byte {file.unknown_at} of {size} on'
         notes.append(Note(f'The log is damaged{where}: messages that pyulog could not read are '
-                          'missing, those after them were read.', Defect.DAMAGED_FILE))
+                          'missing, later ones were read.', Defect.DAMAGED_FILE))
     lost = sum(one.duration for one in ulog.dropouts) * 1e-3
     if ulog.dropouts:
         notes.append(f'The logger lost data {counted(len(ulog.dropouts), "time")}, {lost:.3f} s '
