@@ -324,7 +324,8 @@ def _end_of_facts(rows: list[list[str]], skip: int) -> int:
     words = [k for k, row in enumerate(rows) if k >= skip and row and row[0] and not (
         is_value(row[0]) or is_missing(row[0]))]
     end = words[-1] + 1 if len(words) > _IN_A_ROW else 0
-    return end if end and end + _IN_A_ROW < len(rows) and not any(rows[end]) else 0
+    return end if end and end + _IN_A_ROW < len(rows) and not any(rows[end]) and any(
+        map(is_value, rows[end - 1])) else 0
 
 
 def _first_of_data(rows: list[list[str]], skip: int, width: int, places: list[int]) -> int | None:

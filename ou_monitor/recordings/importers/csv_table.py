@@ -408,7 +408,10 @@ def _finest(form: Form, first: int) -> int:
              if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
              and not re.search(
                  'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
-    return next((k for k in (first, *named) if _rises(form, k) and (
+    # A time with decimals is finer than a clock of whole seconds.
+    finer = [k for k in named if any('.' in cell and is_number(cell) for cell in form.cells(k))
+             ] if all(re.search(r':\d\d:\d\d$', cell) for cell in form.cells(first)) else []
+    return next((k for k in (*finer, first, *named) if _rises(form, k) and (
         2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)), first)
 
 

@@ -714,6 +714,26 @@ def test_facts_and_a_title_above_rows_without_names(tmp_path):
     np.testing.assert_allclose(found.voltage, V)
 
 
+def test_a_time_with_decimals_is_finer_than_a_clock(tmp_path):
+    """Arbin, once a second: dates are cut to whole seconds."""
+    path = written(tmp_path, table(
+        ['Data_Point,Test_Time(s),Date_Time,Step_Time(s),Voltage(V)'],
+        lambda k: f'{k},{1.0 - 1e-4 + k:.5f},{clock(k, "%Y-%m-%d %H:%M:%S", 1.0)},0.5,{V[k]}'))
+    np.testing.assert_allclose(read_recording(path).t, K + 1.0 - 1e-4)
+
+
+def test_blank_lines_around_names_and_units(tmp_path):
+    """MoTeC: facts, a blank line, names, units, a blank line."""
+    path = written(tmp_path, table(
+        [*(f'"{name}","fact",,' for name in 'Format Venue Vehicle Driver Device Comment'.split()),
+         '"Log Date","28/11/2026",,', '"Log Time","10:38:24",,', '"Rate","50.000","Hz",', '', '',
+         '"Time","Throttle Pos","Battery Voltage","Battery Current"', '"s","%","V","A"', '', ''],
+        lambda k: f'"{0.02 * k:.3f}","{100 * U[k]:.1f}","{V[k]}","{AMPS[k]}"'))
+    found = read_recording(path)
+    np.testing.assert_allclose(found.throttle, U, atol=1e-3)
+    np.testing.assert_allclose(found.current, AMPS)
+
+
 def test_a_voltage_with_a_current_of_its_name_is_preferred(tmp_path):
     path = written(tmp_path, table(
         ['t,12V battery voltage,HV battery voltage,HV battery current'],
