@@ -276,7 +276,7 @@ def reading_times(t: FloatArray, period: float) -> FloatArray:
 
 
 def scatter_words(t: FloatArray, least: float) -> str:
-    """Return a note on steps between stamps, s, that scatter; empty if by less than `least`."""
+    """Return a note on the scatter of steps between stamps, s; empty if it is at most `least`."""
     steps = np.diff(t)
     usual = float(np.median(steps))
     scatter = float(np.sqrt(np.mean((steps[steps <= GAP_STEPS * usual] / usual - 1.0) ** 2)))

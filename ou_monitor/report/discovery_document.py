@@ -159,9 +159,9 @@ def _under_load(finding: Finding) -> str:
         return ''
     factor, unit = (finding.full, ' A') if load == 'current' else (1.0, '')
     low, high = (number(factor * end, 2) + unit for end in (fall.low, fall.high))
-    found = (f'From the readings at {load} up to {low} to those from {high} on, the median '
-             f'voltage falls by {number(fall.measured, 2)} V, with the drift between them; '
-             f'{number(fall.explained, 2)} V by the model'
+    found = (f'The median voltage at {load} of {high} or more is {number(fall.measured, 2)} V '
+             f'lower than at {low} or less (drift included); the model gives '
+             f'{number(fall.explained, 2)} V'
              + ('.' if fall.fits else ': trust the readings.'))
     if dips.count and dips.made is not None:
         made = (f'caused {dips.made} of the {dips.count} dips' if dips.count > 1 else

@@ -277,7 +277,7 @@ class Plot:
         for where, label in sorted(self.marks):
             pixel = float(x(where))
             if _LEFT <= pixel <= right:
-                # To the left of its line at the right edge, and below labels that it would cover.
+                # Near the right edge, left of its line; below earlier labels that it would cover.
                 width = _LETTER * len(label)
                 start = pixel + 4.0 if pixel + 4.0 + width <= right else pixel - 4.0 - width
                 row = next((k for k, end in enumerate(ends) if end <= start), len(ends))
