@@ -24,7 +24,7 @@ from ou_monitor.discovery.gain import (
     covered, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of, why_unknown,
     without)
 from ou_monitor.discovery.load_effects import load_fall, low_dips
-from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
+from ou_monitor.discovery.named import Named, named_causes
 from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
 from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
@@ -141,7 +141,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
         full=state.full, has_throttle=recording.has_throttle, seed=seed)
     return replace(found, words=verdict_words(
-        found, why, named.dropped, uncovered, named.failure == INTERRUPTED, against))
+        found, why, named.dropped, uncovered, against))
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:

@@ -37,10 +37,6 @@ _SURE = 25.0
 STOPPED = ('The search for causes was cut short because the next ones would have taken too long; '
            'there may be more.')
 
-# Note if the user stopped the search.
-INTERRUPTED = ('The search for causes was stopped by the user: these are the causes found so far; '
-               'there may be more.')
-
 
 @dataclass(frozen=True, eq=False)
 class Named:
@@ -98,8 +94,6 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                 break
             search = rest
             found = _fit_everything(fitter, search, bank)
-    except KeyboardInterrupt:
-        failure = INTERRUPTED
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
             raise

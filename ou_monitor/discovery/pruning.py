@@ -55,18 +55,12 @@ class Pruned:
 def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
                   scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Pruned:
     """Remove the causes that do not improve held-out predictions, the worst first."""
-    # Interrupted (Ctrl-C), it returns the current model; gains not yet measured are unknown.
     state = Pruned(held_out(samples, model), list(names))
     for turn in range(_ROUNDS):
         state.worth = []
-        try:
-            _leave_out_vague(samples, state)
-            _measure(samples, state, plain, scored, lambda share: progress(
-                1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
-        except KeyboardInterrupt:
-            missing = len(state.names) - len(state.worth)
-            state.worth += [Worth(chance=0.0)] * missing
-            return state
+        _leave_out_vague(samples, state)
+        _measure(samples, state, plain, scored, lambda share: progress(
+            1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
                    and not decision.improves_predictions(worth.gain, worth.error, worth.chance)
                    and not _absorbs_trend(samples, state, k)

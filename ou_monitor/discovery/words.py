@@ -178,11 +178,11 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 
 def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), uncovered: int = 0,
-                  stopped: bool = False, doubts: Sequence[str] = ()) -> tuple[str, ...]:
+                  doubts: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the verdict, a sentence each: causes, their gain, whether it is right, refusal."""
     # why: reason for an unknown gain; uncovered: samples at throttle that other blocks lack.
     if not found.causes:
-        return (plain(by_load(_without_causes(found, dropped, uncovered, stopped), found.load)),)
+        return (plain(by_load(_without_causes(found, dropped, uncovered), found.load)),)
     order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
     names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
     more = len(names) - _FIRST
@@ -197,14 +197,11 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
         f'{": ".join([closer, *(["; ".join(doubts)] if doubts else [])])}.', *refused))
 
 
-def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int, stopped: bool) -> str:
+def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> str:
     if found.verdict is Verdict.NO_EFFECT:
         return ('The plain OU simulates this recording: none of the statistics that can be '
                 'computed at this length deviates.')
     left = remaining_words(found.remaining)
-    if stopped:
-        return ('The simulation deviates from the recording; the search was stopped before it '
-                f'found a cause: {left}.')
     return ('The simulation deviates from the recording, and no known cause explains it: '
             + f'{left}.' + (
                 f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part.'
