@@ -49,7 +49,7 @@ FLOWN = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'roma', 'bf3s')}
 CELLS = {'gecko': 4, 'nazgul': 4, 'roma': 6, 'bf3s': 3, 'hiro': 4, 'erle': 3}
 # Time between reports, and before the first one that is counted, s.
 LOOK, SETTLED = 0.1, 20.0
-# An alarm from BEFORE a dip to AFTER it catches it, s; a lone dip has no other for ALONE before.
+# A dip is caught by an alarm from BEFORE to AFTER its start, s; lone: no other dip ALONE before.
 BEFORE, AFTER, ALONE = 2.0, 0.25, 4.0
 # The limit drawn; the voltage is drawn as its lowest value in each COLUMN seconds.
 DRAWN, COLUMN = '5 %', 0.3
@@ -301,7 +301,7 @@ def recorded_flights(options: argparse.Namespace) -> str:
 # The closed loop: readings and reports per second (`publish_rate`), limit, V, and time in which
 # the load becomes known, s.
 RATE, REPORTS, LIMIT, WARM_UP = 100, 10, 13.2, 30.0
-# Time between dips, and their length, s; an alarm later than this after a dip is not its own, s.
+# Time between dips, and their length, s; maximum time between a dip and an alarm for it, s.
 APART, DIP, ITS_OWN = (6.0, 12.0), (0.02, 0.5), 0.5
 
 

@@ -121,7 +121,7 @@ def median3(v: np.ndarray) -> np.ndarray:
 def throttles(rng: np.random.Generator, flights: int, n: int, rate: float,
               dwell: tuple[float, float], span: tuple[float, float],
               ramp: tuple[float, float] | None = None) -> np.ndarray:
-    """Return throttle in steps, half of them as ramps (all ranges in s), shape (flights, n)."""
+    """Return throttle in steps, half of them ramps, shape (flights, n) (dwell and ramp in s)."""
     out = np.empty((flights, n))
     for row in out:
         at, before = 0, float(rng.uniform(*span))

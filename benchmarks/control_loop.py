@@ -101,7 +101,7 @@ class Loop:
     # Voltage without load, V; its fall per unit load, V.
     nominal: float = 5.0
     sag: float = 0.75
-    # Of the supply: 1/s; sigma in a quiet hover, V/sqrt(s); power of the load.
+    # Supply: relaxation, 1/s; sigma in a quiet hover, V/sqrt(s); exponent of the load in sigma.
     alpha: float = 63.0
     intensity: float = 0.632
     steepness: float = 0.5

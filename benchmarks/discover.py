@@ -304,8 +304,8 @@ class Injected:
         """
         Return 'yes', 'no', or 'there' if the original piece already gets the name.
 
-        An effect is named if a right name is in the set, and occurs less often in the set of the
-        original piece.
+        An effect is named if a right name is in the set, and occurs in it more often than in the
+        set of the original piece.
         """
         right = EFFECTS[self.effect][1]
         if any(self.named.count(name) > self.clean.count(name) for name in right) or (

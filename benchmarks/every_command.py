@@ -4,7 +4,7 @@ Run every command on every recording of a folder: no traceback, one line of erro
 python benchmarks/every_command.py FOLDER [--quick] [--only NAME ...]
 
 One process at a time.  `--quick` leaves out discover, compare, fleet and reproduce (minutes
-instead of hours of a core for 30 flights).  Each JSON is also searched for intervals that span
+instead of hours for 30 flights).  Each JSON of `analyze` is also searched for intervals that span
 more than a factor of 10 either way.  The exit status is 1 if anything is wrong.
 """
 

@@ -341,7 +341,7 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
                    'fmax': 300.0, 'max_lag': limit, 'n0': GYRO**2 / RATE}
         setting = f'lag <= {limit:g} degrees' if limit else 'free'
         say(f'{KALMAN}, {setting}')
-        # It learns from powers, which hardly change with the sign of the noise: half the
+        # The law learns from powers, which hardly depend on the sign of the noise: half the
         # difference of both outputs is the noise, half the sum the signal.
         both, cutoff = adaptive(options, flown, seen, flown.truth + flown.noise)
         other, _ = adaptive(options, flown, seen, flown.truth - flown.noise)

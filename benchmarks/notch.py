@@ -130,7 +130,7 @@ def rpm_filter(gyro: gyros.Gyro) -> tuple[np.ndarray, np.ndarray]:
     motors = signal.lfilter(b, a, gyro.rpm / 60.0, axis=0)
     f = np.concatenate([k * motors for k in (1, 2, 3)], axis=1)
     share = np.clip((f - 100.0) / 50.0, 0.0, 1.0) * (f < 0.48 * gyro.rate)
-    # A notch above the limit has no effect here; Betaflight (3.2 kHz or more) keeps it there.
+    # Notches above the limit are left out; Betaflight, at 3.2 kHz or more, holds them at it.
     keep = share.max(axis=0) > 0.0
     return notches(gyro, np.maximum(f, 100.0)[:, keep], 0.2, share[:, keep])
 

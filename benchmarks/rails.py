@@ -25,7 +25,7 @@ RAILS: dict[str, tuple[str, int | None]] = {
     'ar8': ('raw/bf_ar8_6s.BFL', None), 'nazgul': FLIGHTS['nazgul'], 'roma': FLIGHTS['roma'],
     'in_xr': ('raw/in_xr_141340.TXT', None)}
 AHEAD, LOOK = 1.0, 0.1  # s
-FORGETTING, LEVEL, OHM, LEVEL_VAR, OHM_VAR = 0.95, 4.2, 0.005, 1.5, 0.1  # a cell
+FORGETTING, LEVEL, OHM, LEVEL_VAR, OHM_VAR = 0.95, 4.2, 0.005, 1.5, 0.1  # Per cell
 
 
 def peer(voltage: np.ndarray, current: np.ndarray) -> np.ndarray:

@@ -125,7 +125,7 @@ def collect(case: Case, messages: Any) -> Columns:
 
 
 def rosbags(path: Path, case: Case) -> Columns:
-    """Read with rosbags: `AnyReader`, a message an object."""
+    """Read with rosbags: `AnyReader`, one object per message."""
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         wanted = [c for c in reader.connections if c.topic in (VOLTAGE, THROTTLE)]
         return collect(case, ((c.topic, t, reader.deserialize(data, c.msgtype))
@@ -133,7 +133,7 @@ def rosbags(path: Path, case: Case) -> Columns:
 
 
 def ours(path: Path, case: Case) -> Columns:
-    """Read with this package, to the same arrays as the others."""
+    """Read with this package, into the same arrays as rosbags."""
     bag = BagReader(path)
     choice = choose(path, bag.topics, msg_config=case.config)
     columns = read_fields(bag, {VOLTAGE: choice.specs['voltage'],

@@ -41,7 +41,7 @@ _SHORT = {'published risk': 'published', 'window alone, errors averaged': 'windo
 RATE, FINE = 1000.0, 20
 # Throttle of a flight: range of its values, and of their durations, s.
 _THROTTLE, _DWELL = (0.15, 0.9), (2.0, 9.0)
-# Seconds before the first prediction, and between predictions.
+# Seconds before the first prediction, and window of the estimator, s.
 WARM, WINDOW = 3.0, 2.0
 # Samples from one report of the monitor to the next: a slow companion computer.
 STEP = 250
@@ -66,7 +66,7 @@ def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float
     """
     Predict each `every` s, over horizons (s) without overlap, with a level (V) for each flight.
 
-    Only if the estimate is usable and the rail is not already below the level.
+    Skip times at which the estimate is not usable or the rail is already below the level.
     """
     count, ahead = flights.t.size, round(horizon * RATE)
     for f, level in enumerate(levels.tolist()):

@@ -68,7 +68,7 @@ WARM_UP, BLOCKS = 600.0, 20
 # How long the node may report what came before a phase, s: the longest `stale_after` that is set,
 # and one report.
 LINGER = 2.3
-# The kernel's waiting time in a poll that counts as a pause of the node, s.
+# Minimum waiting time for a CPU, by the kernel, that counts as a pause of the node, s.
 WAIT = 0.05
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 
@@ -165,7 +165,7 @@ def delay(dip: Mapping[str, Any], heard: Heard, pauses: Sequence[Span]) -> float
 
 def fate(dip: Mapping[str, Any], heard: Heard) -> str:
     """Return why a dip was not reported: 'lost', 'unheard' or 'missed'."""
-    # From the last state before it to the first one a second after it.
+    # From the last state before the dip to the first one a second after it.
     at = bisect_right(heard.states, (dip['begin'],))
     last = next((k for k in range(at, len(heard.states))
                  if heard.states[k].at > dip['end'] + IN_TIME), len(heard.states) - 1)
@@ -350,7 +350,7 @@ class Soak:
         node = Process('estimator', [
             '--ros-args', '-r', '__ns:=/soak', '-p', 'brownout.hold:=0.0', '-p',
             f"state_file:={self._folder / 'latch'}"], self._domain, self._folder)
-        # Before it has threads.
+        # Before the node starts threads, which inherit it.
         set_priority(self._priority, node.popen.pid)
         return node
 

@@ -46,13 +46,13 @@ UNSEEN = {'only_nan': 0.7, 'millivolts': 0.7, 'type': 0.7, 'silent': 0.7, 'resta
 # In these phases no estimate is possible, so the flag must never be false.
 NEVER_FALSE = ('frozen', 'backwards', 'wild', 'only_nan', 'type', 'silent')
 LONG, SHORT = (4.0, 12.0), (2.0, 4.0)
-# Times without a duty to see dips, s: after a new publisher (discovery), after the start, and
+# Times in which dips may be missed, s: after a new publisher (discovery), after the start, and
 # before a publisher ends (its last messages may be lost).
 SETTLE, FIRST, LEAVE = 1.0, 3.0, 0.3
 # Of dips: time between them, s (dense: the least at which they can be distinguished), length, s,
 # and voltage, V (never above the lowest floor that is set).
 BETWEEN, DENSE, DIP, DEPTH = (1.5, 5.0), (1.3, 2.0), (0.04, 0.08), (3.0, 4.1)
-# Events at the node: s between them.
+# Time between two actions on the node, s.
 PAUSE = (1.0, 5.0)
 SLICES = ((0.02, 0.01), (0.05, 0.05), (0.2, 0.1), (0.4, 0.2))
 
@@ -194,7 +194,7 @@ BURST, MOST = 100, 1000
 
 
 class Source:
-    """Sends what is due."""
+    """Sends the messages of the schedule when they are due."""
 
     def __init__(self, seed: int, seconds: float, log: TextIO, dense: bool) -> None:
         self._rng = random.Random(f'source {seed}')

@@ -23,7 +23,7 @@ class Option:
 
 
 class OptionalOut(argparse.Action):
-    """A flag that makes OUT optional (argparse accepts an always optional OUT only up front)."""
+    """A flag that makes OUT optional (an always optional OUT could not follow an option)."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:

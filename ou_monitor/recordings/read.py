@@ -110,7 +110,7 @@ def _read(
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
                          'for logs and CSVs')
-    # A CSV or a log needs none of the modules that read bags.
+    # Imported here, because a CSV or a log needs none of the modules that read bags.
     from ou_monitor.recordings.bag_samples import read_bag
 
     return tidy(read_bag(
