@@ -35,6 +35,9 @@ _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
           'one_relaxation': 'not one relaxation', 'second_relaxation': 'second relaxation'}
 # Warnings that change the meaning of every number.
 _BEWARE = {
+    'VOLTAGE_SIGN': (
+        'Beware: the voltage is negative throughout: swap the leads of the sensor, or change the '
+        'sign.'),
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
     'TIME_UNIT': 'Beware: the time seems to be in a smaller unit.'}
 
@@ -65,17 +68,20 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
 
 
 def answer(analysis: Analysis) -> list[str]:
-    """Return the answer: lowest voltage, safe throttle, and sigma and tau if known."""
+    """Return the answer: doubts, lowest voltage, safe throttle, and sigma and tau if known."""
     curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
+    beware = [words for name, words in _BEWARE.items() if name in names]
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
-        f'Safe up to {100.0 * curves.budget:.0f} % throttle{_fall_within_budget(analysis)}.'
+        f'At the end, safe up to {100.0 * curves.budget:.0f} % throttle for {curves.horizon:g} s'
+        f'{_fall_within_budget(analysis)}.'
         if curves.budget > 0.0 else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
         f'{_why_no_throttle(analysis)}.']
-    return [first, *safe, *others, *craft_advice(analysis.craft),
-            *_numbers(analysis), *_change(analysis),
-            *(words for name, words in _BEWARE.items() if name in names)]
+    supply = [first, *safe, *others, *craft_advice(analysis.craft)]
+    # If the voltage has the wrong sign, only its noise has a meaning.
+    return [*beware, *([] if 'VOLTAGE_SIGN' in names else supply), *_numbers(analysis),
+            *_change(analysis)]
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
@@ -97,7 +103,8 @@ def _budget(analysis: Analysis) -> str:
             # The user has to confirm that the supply is a lithium pack.
             source = 'from the log' if craft.cells_from == 'log' else 'a guess from the voltage'
             return (f'unknown: no limit; --cells {craft.cells} ({source}) sets it to '
-                    f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage to any other')
+                    f'{CELL_LIMIT * craft.cells:g} V (empty under load), --brownout-voltage to '
+                    'any other')
         return ('unknown: no limit; --brownout-voltage or --cells sets one (the default of '
                 f'{DEFAULT_LIMIT:g} V is for a 5 V rail, and this supply is '
                 f'at {number(middle)} V)')
@@ -111,8 +118,8 @@ def _budget(analysis: Analysis) -> str:
     if not curves.budget:
         return (f'no throttle, {_why_no_throttle(analysis)}: the risk {what} is '
                 f'{curves.risk[0]:.2g}')
-    words = (f'{100.0 * curves.budget:.0f} % throttle if held: the risk {what} stays under '
-             f'{100.0 * curves.limit:g} %')
+    words = (f'{100.0 * curves.budget:.0f} % throttle if held at the end of the recording: the '
+             f'risk {what} stays under {100.0 * curves.limit:g} %')
     beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
               if u > curves.budget and p >= 2.0 * curves.limit]
     if beyond:

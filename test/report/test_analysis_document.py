@@ -19,15 +19,18 @@ def analysis():
 
 
 def test_headline_warns_of_what_changes_its_own_numbers():
-    """Millivolts; nothing where nothing is wrong."""
+    """Millivolts, swapped leads; nothing where nothing is wrong."""
     simulated = recording(1, TRUTH, seconds=4.0)
     assert not any('Beware' in one for one in answer(analyze(simulated)))
-    sentence = answer(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))[-1]
+    sentence = answer(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))[0]
     assert sentence == ('Beware: the voltages seem to be millivolts or counts, not volts.')
+    swapped = answer(analyze(replace(simulated, voltage=-simulated.voltage)))
+    assert swapped[0].startswith('Beware: the voltage is negative throughout')
+    assert not any('fell' in one or 'safe' in one or 'sag' in one for one in swapped)
     slow = replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
                    throttle=simulated.throttle[::20], current=None)
     found = analyze(slow)
-    assert answer(found)[-1] == 'Beware: the time seems to be in a smaller unit.'
+    assert answer(found)[0] == 'Beware: the time seems to be in a smaller unit.'
     assert 'TIME_UNIT' in {item.name for item in found.quality}
     # Dates since 1970 are in s.
     dated = analyze(replace(slow, t=1.7e9 + slow.t))
@@ -99,6 +102,7 @@ def test_a_safe_throttle_that_did_fall_below_the_limit_is_contradicted(analysis,
         analysis.by_throttle, voltage=lowest + 0.01, budget=budget))
     for words in (dict(facts(safe))['Safe up to'], ' '.join(answer(safe))):
         assert ('yet the voltage was below' in words) == warned
+    assert f'At the end, safe up to {100.0 * budget:.0f} % throttle for 5 s' in words
     above = replace(safe, by_throttle=replace(safe.by_throttle, voltage=lowest - 0.01))
     assert 'yet the voltage' not in ' '.join(answer(above))
 
