@@ -97,7 +97,7 @@ def test_a_mixed_or_unknown_unit_is_refused(t, words):
 
 CALLS = {
     'analyze': analyze, 'discover': discover, 'compare': lambda one: compare(one, seeds=20),
-    'coupling': lambda one: coupling(one, (one.t, one.voltage)), 'supply_facts': supply_facts}
+    'coupling': lambda one: coupling(one, (one.t, -one.voltage)), 'supply_facts': supply_facts}
 
 
 @pytest.mark.parametrize('call', CALLS)

@@ -133,6 +133,8 @@ def estimate_coupling(
     for name, one in zip(series, pieces[:2]):
         if not (np.abs(one)**2).sum() > 0.0:
             raise InputError(f'{name} does not change within {low:g}..{high:g} Hz')
+    if np.array_equal(pieces[0], pieces[1]):
+        raise InputError(f'{name} is the voltage itself: name another signal')
     count = len(pieces[0])
     if count < FEWEST:
         raise InputError(

@@ -318,7 +318,8 @@ def check_values(settings: object, prefix: str = '') -> None:
             if value not in parameter.choices:
                 raise ValueError(
                     f"{parameter.name}: unknown '{value}': "
-                    f'{nearest(str(value), parameter.choices)}')
+                    f'{nearest(str(value), parameter.choices)}'
+                    + ', or a number above 0' * parameter.mixed)
         elif isinstance(parameter.default, (bool, str)) and not parameter.mixed:
             if not isinstance(value, type(parameter.default)):
                 word = 'true or false' if isinstance(parameter.default, bool) else 'text'

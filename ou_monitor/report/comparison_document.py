@@ -91,11 +91,13 @@ def _path(found: Agreement) -> list[tuple[str, str]]:
 def _voltage(found: Agreement) -> Plot:
     at = found.traces
     plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300)
-    plot.band(at.at, at.low, at.high, 'simulated, 95 %', _SIMULATED)
-    plot.line(at.t, at.simulated, 'one simulation', _SIMULATED, 'faint')
-    plot.line(at.t, at.voltage, 'measured', 0)
+    # From its start, as on the other pages: stamps may be dates.
+    t = at.t - at.t[0]
+    plot.band(at.at - at.t[0], at.low, at.high, 'simulated, 95 %', _SIMULATED)
+    plot.line(t, at.simulated, 'one simulation', _SIMULATED, 'faint')
+    plot.line(t, at.voltage, 'measured', 0)
     for level in found.levels:
-        plot.level(at.t, level, '', _MEASURED)
+        plot.level(t, level, '', _MEASURED)
     return plot
 
 
@@ -104,7 +106,7 @@ def _others(found: Agreement) -> list[Part]:
     drawn: list[Part] = []
     if np.isfinite(at.throttle).any():
         drawn.append(Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
-            at.t, at.throttle, '', 2)))
+            at.t - at.t[0], at.throttle, '', 2)))
     beside = []
     if at.response.size:
         plot = Plot(f'Mean response to {found.rises} rises of throttle', 'time since the rise, s',

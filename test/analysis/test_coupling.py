@@ -207,3 +207,9 @@ def test_rare_chances_come_from_the_law_of_the_draws(law, tail):
     found = _tail(np.append(first, drawn[drawn < first]), law)
     # Mean and variance have errors of 1 %, which the tail magnifies.
     assert found == pytest.approx(1e-4, rel=0.3)
+
+
+def test_the_voltage_is_no_signal():
+    t, voltage, _, throttle = flight(np.random.default_rng(5))
+    with pytest.raises(InputError, match='the signal is the voltage itself'):
+        estimate_coupling(t, voltage, t, voltage, throttle=throttle)
