@@ -32,6 +32,8 @@ from ou_monitor.text import printable
 FOLDER = 'parts'
 # Name and text of the file that marks this folder as written by fleet.
 _MARK, _MARK_TEXT = 'ou_monitor_fleet.txt', b'Results of ou-monitor fleet, one a recording.\n'
+# How the file of each result begins.
+_BEGIN = b'{"error": ""'
 # Maximum size of a result file, bytes; typical: 10 kB.
 _MOST = 50_000_000
 
@@ -68,14 +70,18 @@ class SavedResults:
                                + '.json')
 
     def load(self, source: FoundRecording) -> dict[str, Any] | None:
-        """Return the result of a recording; None if there is none."""
+        """Return the result of a recording; None if there is none; a foreign file is refused."""
+        path = self._path(source)
         try:
-            with open_regular(self._path(source)) as file:
-                found = json.loads(file.read(_MOST + 1)[:_MOST])
+            with open_regular(path) as file:
+                content = file.read(_MOST).rstrip(b'\0')
+            if content[:len(_BEGIN)] != _BEGIN[:len(content)]:
+                raise InputError(f"'{path}' was not written by fleet: move it elsewhere")
+            found: dict[str, Any] = json.loads(content)
         except (OSError, ValueError, RecursionError):
-            # Missing, truncated by a power loss, or foreign: compute it again.
+            # Missing, or truncated by a power loss: compute it again.
             return None
-        return found if isinstance(found, dict) and found.get('error') == '' else None
+        return found
 
     def save(self, source: FoundRecording, result: Mapping[str, Any]) -> None:
         """Save the result of a recording."""

@@ -87,7 +87,7 @@ def test_a_folder_without_permission_to_enter_is_noted(odd, monkeypatch):
 
 
 @pytest.mark.parametrize('content', [
-    None, '[' * 100_000, '{}', '[]', '"x"', '{"error": 0}', '1' * 9999])
+    None, '', '\0' * 99, '{"err', '{"error": "", "levels": ' + '[' * 100_000])
 def test_invalid_saved_results_are_computed_again(odd, tmp_path, content):
     (source,) = find_recordings([str(odd / 'flight.csv')]).sources
     parts = SavedResults(tmp_path / 'out', {})
@@ -99,6 +99,18 @@ def test_invalid_saved_results_are_computed_again(odd, tmp_path, content):
     else:
         path.write_text(content)
     assert parts.load(source) is None
+
+
+@pytest.mark.parametrize('content', ['mine', '{}', '[' * 100_000, '{"error": 0}', '\0mine'])
+def test_a_foreign_file_in_place_of_a_saved_result_is_refused(odd, tmp_path, content):
+    (source,) = find_recordings([str(odd / 'flight.csv')]).sources
+    parts = SavedResults(tmp_path / 'out', {})
+    parts.save(source, {'error': '', 'levels': []})
+    (path,) = (tmp_path / 'out' / 'parts').glob('*.json')
+    path.write_text(content)
+    with pytest.raises(InputError, match=f'{path.name}.*not written by fleet'):
+        parts.load(source)
+    assert path.read_text() == content
 
 
 @pytest.mark.parametrize('text', ['(' * 900, 'a{99999999999999999999}', '*'])
