@@ -29,8 +29,8 @@ _LIMITS = frozenset({Status.TOO_FEW_SAMPLES, Status.TOO_SHORT, Status.UNBOUND, S
 _UNEVEN = 0.05
 # Maximum voltage of a UAV supply, V; any supply in millivolts exceeds it.
 _MOST_VOLTS = 1000.0
-# A wrong time unit is suspected above the first step, s (battery messages of autopilots come more
-# often), or if a recording with steps above the second, s, is longer than the third, s.
+# Step, s, above which a wrong time unit is suspected (battery messages of autopilots come more
+# often); the same in a recording of more than _LONG_FLIGHT, s.
 _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
 # Tolerance of throttle beyond 0..1 (trim), and maximum share of samples beyond that.
 _TRIM, _RARE = 0.05, 0.01

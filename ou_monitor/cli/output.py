@@ -287,7 +287,7 @@ def check_folder(path: Path) -> None:
 def deliver(args: argparse.Namespace, found: Result, report: str | Path | None = None,
             **files: object) -> None:
     """Write a result to the page, JSON file and terminal that the arguments name."""
-    # `report` is the path of a page that has been checked: an existing page is overwritten.
+    # The caller has checked the path of a `report`, so an existing page is overwritten.
     force = args.force or report is not None
     report = report or getattr(args, 'report', None)
     document = found.document(shlex.join(['ou-monitor', *args.words]))

@@ -241,7 +241,7 @@ def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: Floa
 
 
 def covered(samples: Samples) -> npt.NDArray[np.bool_]:
-    """Return which samples are at, or soon after, throttle that other blocks contain."""
+    """Return which samples are at throttle of other blocks, and not soon after other throttle."""
     found = np.ones(samples.n, dtype=np.bool_)
     u = samples.throttle
     if u is None:

@@ -7,7 +7,7 @@ A multirotor's power network: components, the load at a throttle, and a rail as 
 
 The network is linear about its operating point, dx = A x dt + B dW, and the rail's deviation is
 c x.  Noise is coloured, with one state per source, so that the variance stays finite where a
-capacitor's ESR, r below, turns current directly into voltage.
+capacitor's ESR (r) turns current directly into voltage.
 
 Limits: leads have no inductance, so edges faster than R/L (0.1 to 1 us) are not modelled.  The
 battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  There

@@ -33,7 +33,7 @@ class TopicChoice:
     """The fields to read from a bag."""
 
     config: MsgConfig  # The source
-    # VOLTAGE, and THROTTLE and CURRENT if there are, -> their fields, with the topics of this bag.
+    # Fields, with the topics of this bag, by VOLTAGE and, where present, THROTTLE and CURRENT.
     specs: dict[str, FieldSpec]
     notes: tuple[str, ...]  # Notes on unexpected choices, one sentence each
 
@@ -70,7 +70,7 @@ def choose(
     throttle, notes = _throttle(path, config, topics, topic, throttle_topic)
     others = [name for name in _by_suffix(config.voltage, topics) if name != topic]
     if voltage_topic is None and others:
-        notes = (*notes, f'{topic} was taken for the voltage; {some(others)} would fit too: '
+        notes = (*notes, f'{topic} was used as the voltage; {some(others)} would fit too: '
                          'choose with --voltage-topic.')
     specs = {VOLTAGE: replace(config.voltage, topic=topic), THROTTLE: throttle,
              CURRENT: _current(config, topics, topic)}
@@ -149,7 +149,7 @@ def _throttle(
     spec = config.throttle
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
-        # Read a topic named by the user like any config that has a throttle of its type.
+        # Read a topic named by the user as the first of these with its type does.
         for one in (spec, *(c.throttle for c in list_msg_configs().values()),
                     FieldSpec(topic, FLOAT64, 'data')):
             if one is not None and one.type == topics[topic]:
@@ -264,7 +264,7 @@ def read_bag(
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
              ends: FloatArray, own: npt.NDArray[np.bool_], sample_rate: float | None,
              ) -> tuple[ThrottleHold, int]:
-    """Return a throttle or current to pair with voltages (ends in s), and its unknown values."""
+    """Return a throttle or current to pair with voltages (ends in s), and a count of NaN."""
     # Of the values before the part, which starts at `first`, ns, only the last one is needed.
     known = np.flatnonzero(np.isfinite(column.values[:column.place(first)]))
     _, column = column.split(int(known[-1]) if known.size else 0)

@@ -58,7 +58,7 @@ class SourceClock:
         self._arrived = -math.inf
 
     def take(self, stamps: FloatArray, received: FloatArray, arrived: float) -> None:
-        """Register samples, s: `arrived` of the last one is on the monotonic clock."""
+        """Register samples, s; arrived: arrival of the last one on the monotonic clock."""
         newest = int(np.argmax(stamps))
         delay = float(received[newest] - stamps[newest])
         least = float(np.min(received - stamps))
@@ -91,8 +91,8 @@ class _Track:
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # After a silence, either messages were lost, or none was sent: prefer the first by half a
-        # message.
+        # After a silence, messages were lost, or none was sent: the second needs a fit better by
+        # half a message.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:
@@ -180,8 +180,8 @@ BoolArray = npt.NDArray[np.bool_]
 # spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm leaves a lag of 1 ms.
 FOLLOW = 10.0
 
-# A difference above this and above two blocks counts as a gap: a busy companion computer delays
-# blocks by about 100 ms and then sends them all.
+# A stamp that differs from the time line by more than this and two blocks reveals a gap; a busy
+# companion computer delays blocks by about 100 ms and then sends them all.
 GAP_LEAST = 0.25  # s
 
 

@@ -361,9 +361,9 @@ _LEAST_JITTER = 1e-12
 
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return predicted probabilities of the last stamp's error, log densities, and more."""
-    # Further: stds and shifts for pairs of successive errors, and the prior of an error.  A shift
-    # is the change of the score due to the error of the step, per unit of `state`.
+    """Return predicted probabilities of the last stamp's error, log densities, and laws."""
+    # Laws: stds and shifts of the score for pairs of successive errors, and the prior of an error.
+    # A shift is the effect of the error of the step, per unit of `state`.
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)
     law /= law.sum()

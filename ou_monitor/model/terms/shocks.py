@@ -20,7 +20,7 @@ from scipy.special import gammainccinv, gammaincinv, ndtr
 _TINY = 1e-280
 # Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
-# Share of samples with a jump above which jumps are not rare events.
+# Maximum share of samples with a jump; with more, jumps are not rare events.
 _OFTEN = 0.05
 
 
@@ -229,7 +229,7 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
 
 def _repetition(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
                 ) -> tuple[float, float]:
-    """Return slope and residual std, V, of the regression of errors on the previous in a run."""
+    """Return slope and residual std, V, of errors regressed on the previous error of their run."""
     e, bad = e[train], bad[train]
     second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
     if second.size < _PAIRS:
@@ -300,7 +300,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
     """Return the samples of the best set of runs (weighted interval scheduling)."""
     order = np.argsort(end, kind='stable')
     begin, end = begin[order], end[order]
-    # For each run, the number that end before it begins (a run uses the innovation at its end).
+    # For each run, how many runs end before it begins (a run uses the innovation at its end).
     clear = np.searchsorted(end, begin, side='left').tolist()
     best, taken = [0.0], []
     for value, k in zip(gain[order].tolist(), clear, strict=True):
@@ -319,7 +319,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """Make the noise of each step Student-t, with the same variance; dof holds for one spacing."""
+    """Make the noise of each step Student-t, with equal variance; dof depends on the spacing."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'

@@ -35,8 +35,8 @@ _UNSEEN = 1e-5
 _STILL = 1e-12
 # Minimum correlation of adjacent samples, standard errors, for a fit.
 _CORRELATED = 4.0
-# alpha times the step above which adjacent samples carry no information on the relaxation; number
-# of relaxation times in the window below which a drift may be chance.
+# Maximum of alpha times the step: above it, adjacent samples carry no information on the
+# relaxation.  Minimum number of relaxation times in the window: below it, a drift may be chance.
 _FASTEST, _DOUBTFUL = 4.6, 25.0
 
 
@@ -155,7 +155,7 @@ class _Likelihood(Protocol):
 
 
 def _ends(n: int) -> tuple[FloatArray, FloatArray]:
-    """Return limits of ln a and z: one relaxation time in ten windows, to no correlation."""
+    """Return limits of ln a and z: from a relaxation of ten windows to no correlation."""
     return np.array([math.log(0.1 / (n - 1)), 0.0]), np.array([math.log(2.0 * _FASTEST), _LOUDEST])
 
 
@@ -171,7 +171,7 @@ class SpectralLikelihood:
         """Return the spectra of OU and noise in units of sigma^2, shape (k, bins)."""
         gamma = np.array([arma.block_autocovariance(math.exp(x), self.m) for x in log_a.tolist()])
         a = np.exp(log_a)
-        # Block means of an OU have the correlations of an OU of this variance, but vary less.
+        # Block means have the covariances of an OU of variance `size`, but less variance.
         size = gamma[:, 1] * np.exp(a)
         white = gamma[:, 0] - size + _SMALL * np.expm1(z)
         return np.asarray(self.step * (

@@ -119,10 +119,9 @@ _SLOW = 1.0
 _SHARE, _LAG = 1.0 / 3.0, 0.06
 # Minimum time compared, s, and memory, s.
 _FIRST, _MEMORY = 10.0, 60.0
-# Maximum ratio of residual variances, with another delay and with the present one, to change to
-# the other delay.
+# Another delay is adopted if its residual variance is below this share of the present delay's.
 _BETTER = 0.75
-# Time for which the ratio must stay below the maximum, s.
+# Time, s, for which the residual variance must be below it.
 _LASTING = 3.0
 # Test of the relation to the voltage: length of segments, s, whose responses are nearly
 # independent; memory, s; minimum number of segments.
@@ -269,7 +268,7 @@ class LoadNoise:
 
     @property
     def log_variance(self) -> tuple[float, float, float]:
-        """Return b for a single sample, at least with the noise of rounding."""
+        """Return b for a single sample, with the noise of rounding added."""
         own = 1.0
         if self._between > 0.0:
             own += self._within * (1.0 - 1.0 / self._size) / self._between
