@@ -14,7 +14,7 @@ parameters, which is the expected optimism of a fit (Akaike 1973).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -67,20 +67,28 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
             ) -> Composite | None:
     """Return the model fitted to everything without some of its terms; None if that fails."""
     # If it is worse than the plain fit, it has not converged, and is repeated from another start.
-    kept = [term for k, term in enumerate(model.terms) if k not in indices]
-    # Terms that modify a removed term are removed too.
-    names = {term.NAME for term in kept}
-    kept = [term for term in kept if term.CHANGES is None or term.CHANGES.NAME in names]
+    kept = _complete(term for k, term in enumerate(model.terms) if k not in indices)
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
     known = None if laws else model
-    first = _fitted(samples, kept, known)
-    if first is not None and plain is not None and (
-            float(first.density.sum()) >= float(plain.density.sum())):
-        return first
-    # Without white noise or a response to throttle, the `ou` has to explain their effects.
-    second = _fitted(samples, (guess(samples), *kept[1:]), known)
-    return max((fit for fit in (first, second) if fit is not None), default=None,
+    found = [_fitted(samples, kept, known)]
+    # A model with further states may be fitted to a part of the samples only, which may not show
+    # what the `ou` has to explain instead.  Without these states, all samples are fitted.
+    light = _complete(term for term in kept if term.ROLE is not Role.BLOCK)
+    if len(light) < len(kept):
+        found.append(_fitted(samples, light, known))
+    if plain is None or not any(fit is not None and float(fit.density.sum()) >= float(
+            plain.density.sum()) for fit in found):
+        # Without white noise or a response to throttle, the `ou` has to explain their effects.
+        found.append(_fitted(samples, (guess(samples), *kept[1:]), known))
+    return max((fit for fit in found if fit is not None), default=None,
                key=lambda fit: float(fit.density.sum()))
+
+
+def _complete(terms: Iterable[Term]) -> list[Term]:
+    """Return terms without the modifiers of terms that are missing."""
+    kept = list(terms)
+    names = {term.NAME for term in kept}
+    return [term for term in kept if term.CHANGES is None or term.CHANGES.NAME in names]
 
 
 def _fitted(samples: Samples, terms: Sequence[Term], known: Composite | None

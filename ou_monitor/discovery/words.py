@@ -87,11 +87,14 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
             shown = with_error(value, se.get(name), positive=term.positive(name))
             found.append(f'{term.label(name)} {shown}' if shown == VAGUE_NUMBER else
                          f'{term.label(name)} = {shown} {term.unit(name)}'.rstrip())
-    found += [f'factor over {name} = ' + ', '.join(
-        f'{number(factor)} at {number(at)}' for at, factor in zip(*curve))
-        for name, curve in curves.items()]
+    found += [f'factor over {name} = {curve_text(*curve)}' for name, curve in curves.items()]
     return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '
                                  'plot and --json'] if long else [])])
+
+
+def curve_text(at: Sequence[float], factors: Sequence[float]) -> str:
+    """Return the points of a curve."""
+    return ', '.join(f'{number(factor)} at {number(x)}' for x, factor in zip(at, factors))
 
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
@@ -184,7 +187,8 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
     if not found.causes:
         return (plain(by_load(_without_causes(found, dropped, uncovered), found.load)),)
     order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
-    names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
+    names = list(dict.fromkeys(
+        both_names(cause.name, plain_name(cause.term)) for cause in order))
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
     closer = 'With them the simulation ' + (
@@ -272,7 +276,7 @@ def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
 class CauseRow:
     """One row: a cause, or several terms of one kind that share a gain."""
 
-    name: str  # Name of the cause
+    what: str  # Plain name of the cause
     label: str  # Name, with the number of terms if there are several
     family: str  # Family in the catalogue
     gain: str  # mnat per sample, or `NOT_KNOWN`
@@ -289,7 +293,8 @@ def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
         key = (cause.name, repr(cause.gain), repr(cause.gain_se), _chance(cause))
         groups.setdefault(key, []).append(cause)
     return [CauseRow(
-        group[0].name, group[0].name if len(group) == 1 else f'{group[0].name} x{len(group)}',
+        plain_name(group[0].term),
+        group[0].name if len(group) == 1 else f'{group[0].name} x{len(group)}',
         group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
         _chance(group[0]),
         tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
@@ -398,6 +403,13 @@ def by_load(text: str, load: str) -> str:
         load.capitalize() if found[1] == 'T' else load), text)
 
 
-def both_names(name: str) -> str:
-    """Return the plain name of a cause, followed by its name in code."""
-    return f'{PLAIN_NAMES[name]} ({name})' if name in PLAIN_NAMES else name
+def plain_name(term: Term) -> str:
+    """Return the plain name of a cause, by the inputs of its curves."""
+    name, curves = PLAIN_NAMES.get(term.NAME, term.NAME), term.factors()
+    return name if not curves or 'throttle' in curves else name.replace(
+        'throttle', 'changes of throttle')
+
+
+def both_names(name: str, what: str = '') -> str:
+    """Return the plain name of a cause (by default the usual one), and its name in code."""
+    return f'{what or PLAIN_NAMES[name]} ({name})' if name in PLAIN_NAMES else name

@@ -11,8 +11,8 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.words import (
-    by_load, cause_rows, GAIN, gain_text, overlap_words, parameters, PLAIN_NAMES,
-    plain_words, with_error)
+    by_load, cause_rows, curve_text, GAIN, gain_text, overlap_words, parameters, plain_words,
+    with_error)
 from ou_monitor.records import NAN
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Part, Section, Table, Text)
@@ -94,7 +94,7 @@ def _causes(finding: Finding) -> list[Part]:
     return [
         Table(['cause', 'what it is', 'family', 'gain, mnat/sample',
                'p (fit or gain)', 'alternatives'],
-              [[row.label, by_load(PLAIN_NAMES.get(row.name, row.name), finding.load),
+              [[row.label, by_load(row.what, finding.load),
                 row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
                for row in found], left=[0, 1, 2, 5]),
         Text(GAIN),
@@ -203,9 +203,15 @@ def _parameters(finding: Finding) -> list[Part]:
     rows = []
     assert finding.model is not None
     for term, se in zip(finding.model.terms, finding.se):
+        curves = term.factors()
+        rows += [[term.NAME, f'factor over {name}', curve_text(*curve), '-', 'factor on the noise']
+                 for name, curve in curves.items()]
         for spec in fields(term):
             value = getattr(term, spec.name)
-            value = list(value) if isinstance(value, tuple) else value
+            if isinstance(value, tuple):
+                if curves:
+                    continue
+                value = list(value)
             rows.append([term.NAME, spec.name,
                          with_error(value, se.get(spec.name), positive=term.positive(spec.name)),
                          spec.metadata['unit'] or '-',

@@ -15,6 +15,7 @@ from ou_monitor.discovery.gain import (
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.slow import Drift, FlickerNoise
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
@@ -183,3 +184,19 @@ def test_the_first_guess_is_an_autoregression():
     assert white.alpha == pytest.approx(-1e3 * math.log(0.05))
     slow = guess(Samples(t, np.cos(0.1 * t), None))
     assert 0.1 < slow.alpha < 0.2
+
+
+def test_a_cause_loses_no_more_than_without_further_states(monkeypatch):
+    """With many states only a part is fitted, which may hardly show what is left out."""
+    def fitted(samples, terms, known):
+        names = tuple(term.NAME for term in terms)
+        return SimpleNamespace(names=names, density=np.full(
+            4, -3.0 if 'flicker_noise' in names else 1.0))
+
+    monkeypatch.setattr(gains, '_fitted', fitted)
+    model = SimpleNamespace(terms=(
+        OU(8.0, 0.04, 12.0), LoadSag(0.5, 0.0), Drift(-1e-3, 0.0), FlickerNoise(1e-3, 0.1, 45.0)))
+    for plain in (-4.0, 0.0):
+        less = without(simulated(0, 100), model, 2, plain=SimpleNamespace(
+            density=np.full(4, plain)))
+        assert less.names == ('ou', 'load_sag')

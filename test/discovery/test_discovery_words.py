@@ -8,6 +8,7 @@ from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_text, gain_words, overlap_words, parameters,
     plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.load_dependent import LoadDependentNoise
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.tones import Tone
 import pytest
@@ -131,6 +132,17 @@ def test_every_cause_has_its_words(name):
     told = [p for p in kind.parameters() if not (term.factors() and isinstance(values[p], list))]
     assert all(f'{kind.label(p)} = ' in text for p in told)
     assert all(f'factor over {name} = ' in text for name in term.factors())
+
+
+@pytest.mark.parametrize('index, what, when', [
+    (0.0, 'follows throttle', 'at high throttle'),
+    (4.0, 'follows changes of throttle', 'soon after changes of throttle')])
+def test_noise_says_which_input_it_follows(index, what, when):
+    law = replace(SAG, term=LoadDependentNoise((index, index), (0.1, 0.2), (0.0, 1.0)))
+    assert f'sensor noise that {what} (load_dependent_noise)' in verdict_words(
+        finding(Verdict.EXPLAINED, [law]))[0]
+    assert cause_rows([law])[0].what == f'sensor noise that {what}'
+    assert f'Give readings {when} less weight' in explain(law.term, {}, 0.01, 0.001, [], False)
 
 
 def test_the_verdict_says_what_is_left_or_refused():

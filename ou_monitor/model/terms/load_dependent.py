@@ -285,9 +285,11 @@ class LoadDependentNoise(Term):
     MEANING: ClassVar[str] = (
         'The white noise of the readings grows with throttle or its changes: ripple of the ESCs, '
         'or a rail that relaxes faster than the sampling, which looks the same.')
-    REMEDY: ClassVar[str] = (
+    REMEDY: ClassVar[str] = by_parameters(
         'Sample faster to tell them apart; against ripple, add capacitance at the ESCs or a '
-        'filter before the ADC. Give readings at high throttle less weight.')
+        'filter before the ADC. Give readings at high throttle less weight.',
+        lambda term: LoadDependentNoise.REMEDY if 0 in term.number else
+        LoadDependentNoise.REMEDY.replace('at high throttle', 'soon after changes of throttle'))
     SEPARATED_BY: ClassVar[str] = (
         'the same flight at several times the sampling rate: white noise stays uncorrelated')
 
