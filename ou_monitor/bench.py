@@ -19,8 +19,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import as_numbers, as_seconds, FloatArray, Recording
 from ou_monitor.report.result import Result
-from ou_monitor.text import counted
-from ou_monitor.timeline import ordered, readings_of, supplied
+from ou_monitor.timeline import check_size, ordered, readings_of, supplied
 
 if TYPE_CHECKING:
     from ou_monitor.analysis.analyze import Analysis
@@ -36,8 +35,6 @@ Given = Union[Recording, str, Path]
 Progress = Callable[[float], None]
 Pairs = tuple[npt.ArrayLike, npt.ArrayLike]
 
-# Minimum number of samples: one more than the two parameters of a straight line.
-_FEWEST = 3
 # Minimum rate at which samples are written in blocks by default, Hz.
 _BLOCKS_FROM = 5000.0
 
@@ -51,13 +48,6 @@ def _read(recording: Given) -> Recording:
     from ou_monitor.recordings.read import read_recording
 
     return read_recording(recording)
-
-
-def check_size(recording: Recording) -> None:
-    """Raise InputError if a recording is too short for any estimate."""
-    if recording.n < _FEWEST:
-        raise InputError(f"'{recording.name}' holds {counted(recording.n, 'usable sample')}: "
-                         f'nothing can be estimated from fewer than {_FEWEST}')
 
 
 def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float | None, int]:

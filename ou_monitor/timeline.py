@@ -600,3 +600,14 @@ def _late_words(steps: int, t: FloatArray) -> str:
 def as_column(values: npt.ArrayLike) -> FloatArray:
     """Return values as a float64 array of shape (n,); a scalar becomes one sample."""
     return np.atleast_1d(as_numbers(values))
+
+
+# Minimum number of samples: one more than the two parameters of a straight line.
+LEAST_SAMPLES = 3
+
+
+def check_size(recording: Recording) -> None:
+    """Raise InputError if a recording is too short for any estimate."""
+    if recording.n < LEAST_SAMPLES:
+        raise InputError(f"'{recording.name}' holds {counted(recording.n, 'usable sample')}: "
+                         f'nothing can be estimated from fewer than {LEAST_SAMPLES}')

@@ -15,6 +15,7 @@ from ou_monitor.cli import output
 from ou_monitor.cli.arguments import check_outputs, check_ranges, read_given
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
+from ou_monitor.timeline import check_size
 
 if TYPE_CHECKING:
     from ou_monitor.discovery.finding import Finding
@@ -96,7 +97,7 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
                   given: dict[str, Any]) -> tuple[Recording, Result]:
     """Return the recording, and the result of a function of `bench`, with progress bars."""
     recording, _ = read_given(args)
-    bench.check_size(recording)
+    check_size(recording)
     if getattr(args, 'save_model', None) is not None:
         from ou_monitor.criticism.integrity import examine
         from ou_monitor.discovery.finding import unsaved_load

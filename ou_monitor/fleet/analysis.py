@@ -19,7 +19,8 @@ from ou_monitor.recordings.importers.formats import is_csv
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Defect, defect_of, NAN, Recording
-from ou_monitor.text import counted, printable
+from ou_monitor.text import printable
+from ou_monitor.timeline import check_size
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
         path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
         throttle_topic=options.throttle_topic, columns=options.columns,
         partial=options.partial or is_csv(Path(path)))
-    if recording.n < 2:
-        raise InputError(f'{recording.name} has {counted(recording.n, "usable sample")}: nothing '
-                         'can be estimated from it')
+    check_size(recording)
     if options.cells:
         check_cells(full_voltage(recording), options.cells)
     # Overflows give non-finite values, which the analysis reports in its status.

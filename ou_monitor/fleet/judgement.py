@@ -91,6 +91,7 @@ class Values:
     measured: FloatArray
     throttle: FloatArray
     cells: IntArray  # Cells by which values are divided; 0: they are not; shape (n,)
+    months: FloatArray  # Dates, months since 1970; NaN where unknown; shape (n,)
 
     def shown(self, value: FloatArray | float) -> FloatArray:
         """Convert logarithms, as in the field `value`, to the unit of the quantity."""
@@ -165,7 +166,9 @@ def _values(name: str, rows: Sequence[Row], curve: CommonCurve, value: FloatArra
                   np.array([row['flight'] or 0 for row in rows], dtype=np.intp),
                   np.asarray(value, dtype=np.float64),
                   np.nan_to_num(np.asarray(error, dtype=np.float64)), curve, measured, throttle,
-                  np.zeros(len(rows), dtype=np.intp) if cells is None else cells)
+                  np.zeros(len(rows), dtype=np.intp) if cells is None else cells,
+                  np.array([row['start'].timestamp() / _MONTH if row['start'] else NAN
+                            for row in rows]))
 
 
 def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
@@ -252,6 +255,8 @@ def _knots(u: FloatArray) -> list[float]:
 
 # Minimum flights of a test for drift: two leave no scatter about their line.
 LEAST_FLIGHTS = 3
+# A mean month, s; flights within less show no change per month.
+_MONTH = 365.25 / 12.0 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -270,6 +275,8 @@ class Trend:
     first: int
     last: int
     p_value: float  # Of this test alone
+    # Change of the logarithm per month, and its 95 % interval; NaN where a date is unknown.
+    monthly: tuple[float, float, float] = (NAN, NAN, NAN)
     p_family: float = NAN  # After Holm, over all tests of the fleet
 
     def line(self, flight: FloatArray) -> FloatArray:
@@ -299,11 +306,15 @@ def _trends_of(values: Values) -> list[Trend]:
         mine = mine[np.argsort(values.flights[mine])]
         x, y = values.flights[mine].astype(np.float64), values.value[mine]
         slope, start, se = weighted_line(x, y, values.error[mine])
-        reach = float(stats.t.ppf(0.975, mine.size - 2)) * se
+        width = float(stats.t.ppf(0.975, mine.size - 2))
+        reach, monthly, months = width * se, (NAN, NAN, NAN), values.months[mine]
+        if np.ptp(months) >= 1.0:
+            rate, _, rate_se = weighted_line(months - months[0], y, values.error[mine])
+            monthly = (rate, rate - width * rate_se, rate + width * rate_se)
         # Equal values would give 0 / 0.
         p_value = 2.0 * float(stats.t.sf(abs(slope) / se, mine.size - 2)) if se > 0.0 else 1.0
         found.append(Trend(values.name, name, int(mine.size), slope, slope - reach, slope + reach,
-                           start, int(x[0]), int(x[-1]), p_value))
+                           start, int(x[0]), int(x[-1]), p_value, monthly))
     return found
 
 

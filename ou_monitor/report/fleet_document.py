@@ -137,8 +137,7 @@ def _growth(judged: Judgement, trend: Trend) -> str:
     values = judged.values[trend.quantity]
     first, last = (_without_unit(values, trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
-    return (f'{trend.quantity} {change(trend.slope)} per flight (95 % {change(trend.low)} to '
-            f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}'
+    return (f'{trend.quantity} {_rates(trend)}, {first} to {last} {_UNITS[trend.quantity]}'
             + _a_cell(judged, trend.quantity, trend.vehicle)
             + ' at full throttle' * (trend.quantity == 'sag'))
 
@@ -190,11 +189,17 @@ def change(value: float) -> str:
     return f'{percent:+.0f} %' if abs(percent) >= 10.0 else f'{percent:+.2g} %'
 
 
+def _rates(trend: Trend) -> str:
+    """Return the change per flight, and per month where the dates are known."""
+    rates = {'flight': (trend.slope, trend.low, trend.high), 'month': trend.monthly}
+    return ', '.join(f'{change(rate)} per {what} (95 % {change(low)} to {change(high)})'
+                     for what, (rate, low, high) in rates.items() if math.isfinite(rate))
+
+
 def trend_words(trend: Trend) -> str:
     """Return a drift in a sentence."""
     flights = trend.last - trend.first
-    return (f'{trend.vehicle}: {trend.quantity} drifts by {change(trend.slope)} per flight (95 % '
-            f'{change(trend.low)} to {change(trend.high)}), '
+    return (f'{trend.vehicle}: {trend.quantity} drifts by {_rates(trend)}, '
             f'{change(flights * trend.slope)} over {trend.flights} flights; '
             f'{p_words(trend.p_value)}, fleet-wide {chance(trend.p_family)}.')
 
@@ -451,8 +456,9 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
             for vehicle in fleet.vehicles],
         'drift': [{
             'vehicle': t.vehicle, 'quantity': t.quantity, 'flights': t.flights,
-            'slope': t.slope, 'ci95': [t.low, t.high], 'p_value': t.p_value,
-            'p_family': t.p_family, 'significant': t.p_family <= DRIFT_RATE}
+            'slope': t.slope, 'ci95': [t.low, t.high],
+            'slope_per_month': t.monthly[0], 'slope_per_month_ci95': [*t.monthly[1:]],
+            'p_value': t.p_value, 'p_family': t.p_family, 'significant': t.p_family <= DRIFT_RATE}
             for t in judged.trends],
         'outliers': odd,
         'rows': [{name: value.isoformat() if name == 'start' and value is not None else value

@@ -1,5 +1,6 @@
 """False-alarm rates and power of the fleet report, on tables with known truth."""
 
+from datetime import datetime, timedelta, timezone
 import math
 
 import numpy as np
@@ -47,7 +48,8 @@ def test_the_curve_knows_its_error():
         for k, u in enumerate(rng.uniform(0.1, 0.6, 10)):
             flight = 0.3 * rng.standard_normal()
             rows += [{'path': f'f{k}', 'vehicle': 'v', 'flight': k + 1, 'status': 'OK',
-                      'throttle': u + du, 'time_s': 10.0, 'alpha': None, 'sigma_se': 0.02,
+                      'start': None, 'throttle': u + du, 'time_s': 10.0, 'alpha': None,
+                      'sigma_se': 0.02,
                       'sigma': math.exp(2.0 * u + flight + 0.02 * rng.standard_normal())}
                      for du in (0.0, 0.02)]
         curve = values_of(rows, 'sigma').curve
@@ -146,6 +148,27 @@ def test_drift_keeps_its_rate():
         # Holm bounds the rate: one-sided.
         assert alarms / runs < DRIFT_RATE + 3.0 * math.sqrt(DRIFT_RATE * (1 - DRIFT_RATE) / runs)
     assert not trends([values_of(table(rng, 5, 2), name) for name in QUANTITIES])
+
+
+def test_growth_per_month_needs_dates_a_month_apart():
+    """The line over the dates, fitted as the one over the flights."""
+    rng = np.random.default_rng(3)
+    rows = table(rng, 1, 6, levels=LEVELS[:1])
+    days = [0, 20, 61, 122, 140, 240]
+    for apart, known in ((1.0, True), (1.0, False), (0.1, True)):
+        dated = [{**row, 'start': datetime(2026, 1, 1, tzinfo=timezone.utc) + timedelta(
+            apart * days[row['flight'] - 1])} for row in rows]
+        if not known:
+            dated[2]['start'] = None
+        for name in OF_PACK:
+            values = values_of(dated, name)
+            (found,) = trends([values])
+            if apart < 1.0 or not known:
+                assert np.isnan(found.monthly).all()
+                continue
+            slope, _, se = weighted_line(np.array(days) / 30.4375, values.value, values.error)
+            reach = stats.t.ppf(0.975, 4) * se
+            assert found.monthly == pytest.approx((slope, slope - reach, slope + reach))
 
 
 def test_an_ageing_pack_is_found():

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.fleet.analysis import Options
+from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
 from ou_monitor.fleet.fleet import run_fleet, SavedResults
 from ou_monitor.fleet.vehicles import assign, read_pattern
@@ -111,6 +111,20 @@ def test_a_foreign_file_in_place_of_a_saved_result_is_refused(odd, tmp_path, con
     with pytest.raises(InputError, match=f'{path.name}.*not written by fleet'):
         parts.load(source)
     assert path.read_text() == content
+
+
+@pytest.mark.parametrize('content, words', [
+    (b'0.0,5.1\n\0\1garbage;;;\n0.1,abc\n"unclosed\n', 'cut.csv:3: the byte 0x00 is not text'),
+    (b'0.0,5.1\n' + bytes(range(256)), 'cut.csv:3: the byte 0x00 is not text'),
+    (b'garbage\n', 'cut.csv'),
+    (b'0,5\n1,5.1\n', "'cut.csv' holds 2 usable samples: nothing can be estimated from fewer")])
+def test_a_damaged_or_short_csv_is_an_error_and_not_skipped(content, words, tmp_path):
+    (tmp_path / 'cut.csv').write_bytes(b'time_s,voltage_v\n' + content)
+    (tmp_path / 'tuning.csv').write_bytes(b'gain,value\n' + content)
+    found = find_recordings([str(tmp_path)])
+    assert [source.path.name for source in found.sources] == ['cut.csv']
+    assert len(found.notes) == 1 and 'tuning.csv' in found.notes[0]
+    assert words in work(str(tmp_path / 'cut.csv'), Options())['error']
 
 
 @pytest.mark.parametrize('text', ['(' * 900, 'a{99999999999999999999}', '*'])

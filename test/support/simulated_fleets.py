@@ -35,7 +35,7 @@ def table(rng: np.random.Generator, vehicles: int, flights: int, *, scatter: flo
                     'time_s': time, 'status': 'OK', 'sag': 0.7 * sag, 'sag_se': 0.02,
                     'sag_throttle': 0.8, 'sag_full': sag, 'sag_full_se': 0.02,
                     'resistance': ohm, 'resistance_se': 0.1 * ohm, 'cells': 4,
-                    'cells_from': 'log',
+                    'cells_from': 'log', 'start': None,
                     'sigma': math.exp(sigma + (0.0 if u is None else SLOPE * u + BEND * u * u)
                                       + se * rng.standard_normal()), 'sigma_se': se,
                     'alpha': math.exp(alpha + 2 * se * rng.standard_normal()),

@@ -50,6 +50,8 @@ _LONGEST = 40
 MOST_OF_LINE = 65536
 # Bytes, then lines, in which the format is detected; characters and rows read at once.
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
+# A byte that no text holds.
+_DAMAGE = re.compile(rb'[^\t\n\r\f -\xff]')
 # Consecutive rows of numbers that mark the beginning of the data.
 _IN_A_ROW = 8
 
@@ -162,11 +164,13 @@ class Form(NamedTuple):
         return [row[place] for row in self.rows if place < len(row) and row[place]]
 
 
-def form_of(path: Path, wanted: CsvColumns) -> Form:
-    """Detect the format of a file from its first lines."""
+def form_of(path: Path, wanted: CsvColumns, *, header: bool = False) -> Form:
+    """Detect the format from the first lines (header: the first one alone, up to any damage)."""
     try:
         with open_regular(path) as file:
             head = file.read(_HEAD)
+            if header:
+                head = _DAMAGE.split(head.split(b'\n')[0])[0]
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
     encoding = _encoding(path, head)
@@ -215,6 +219,12 @@ def _encoding(path: Path, head: bytes) -> str:
     kind = kind_of_foreign(head, path)
     # A logger that lost power leaves NUL bytes at the end; `numbers` names their line.
     nul = b'\0' in head and not (b'\n' in head and is_text(head.rstrip(b'\0')))
+    damage = _DAMAGE.search(head)
+    if nul and damage and kind.startswith('its') and is_text(head[:damage.start()][:8]) and (
+            damage.start() >= 8):
+        line = head.count(b'\n', 0, damage.start()) + 1
+        raise InputError(f'{path}:{line}: the byte 0x{damage[0].hex()} is not text: the file is '
+                         'damaged from there on')
     if nul or kind.startswith('it is') and kind != TEXT:
         raise InputError(f'{path} is not text: {kind}')
     try:

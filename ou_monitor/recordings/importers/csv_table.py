@@ -11,6 +11,7 @@ name or in a line of units is taken as stated; an unstated unit is guessed from 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -234,16 +235,16 @@ def read_throttle_alone(path: Path, columns: CsvColumns | None = None,
 
 
 def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
-    """Return whether columns of time and voltage are found in the first lines of a file."""
-    try:
-        wanted = columns or CsvColumns()
-        form = form_of(path, wanted)
-        time = _time_of(path, form, wanted)
-        if not _series_of(path, form, wanted, time):
-            _supply_of(path, form, wanted, time, needed=True)
-        return True
-    except InputError:
-        return False
+    """Return whether the first lines, or the header of a damaged file, have time and voltage."""
+    wanted = columns or CsvColumns()
+    for header in (False, True):
+        with suppress(InputError):
+            form = form_of(path, wanted, header=header)
+            time = _time_of(path, form, wanted)
+            if not _series_of(path, form, wanted, time):
+                _supply_of(path, form, wanted, time, needed=True)
+            return True
+    return False
 
 
 def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: bool = False,
