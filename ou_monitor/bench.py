@@ -347,7 +347,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     voltage : float, optional
         Brown-out level, V; on the bus, if `cells` is given, V per cell (by default 3.3).
     cells : int
-        Cells in series; 0: as in the network or the recording.
+        Cells in series; 0: as in the network or the recording, whose voltage is that of a rail if
+        it fits no pack.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -381,7 +382,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         cells_of, check_cells, full_voltage, pack_limit, stated_limit)
     from ou_monitor.paper.network import completed, PowerNetwork
     from ou_monitor.paper.design import (
-        as_data, CELL_BROWNOUT, default_voltage, design as designed, LEAST, MOST, network_of,
+        as_data, default_voltage, design as designed, LEAST, MOST, network_of,
         SHOWN)
     from ou_monitor.report.design_document import design_document, taken_words
 
@@ -398,18 +399,23 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             raise ValueError('the throttle is missing: pass 0.4 for 40 %, or a recording, whose '
                              '99 % quantile of throttle is used')
         circuit = PowerNetwork(**completed(values))
-        level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
+        level, source = (voltage, 'given') if voltage is not None else default_voltage(
+            circuit.cells if rail == 'bus' else 0, circuit.regulator_voltage)
     else:
         flown = supplied(readings_of(_read(recording)))
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells = values.setdefault('cells', cells_of(flown)[0])
-        if not cells:
-            raise InputError(f'{full:.4g} V fits no number of cells: give --cells N')
-        check_cells(full, cells)
-        level, source = cells * CELL_BROWNOUT, f'{CELL_BROWNOUT} V per LiPo cell'
-        if stated is not None and stated[0] == cells:
+        if cells:
+            check_cells(full, cells)
+        else:
+            # The source is a rail: it feeds no other one, and all its load is in the recording.
+            rail, values = 'bus', {'regulator_voltage': 0.5 * full, 'mcu_current': 0.0, **values}
+        if voltage is not None:
+            level, source = voltage, 'given'
+        elif stated is not None and stated[0] == cells:
             level, source = stated[1], 'from the log'
-        level, source = (level, source) if voltage is None else (voltage, 'given')
+        else:
+            level, source = default_voltage(cells, full)
         flight, facts, risk_of = _flight(
             flown, full, cells, level if rail == 'bus' else None, horizon, risk)
         if not facts.sag.known and 'battery_resistance' not in values:
@@ -419,7 +425,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         throttle = min(1.0, flight.flown[1]) if throttle is None else throttle
         circuit = network_of(flight, throttle, values)
         if rail != 'bus' and voltage is None:
-            level, source = default_voltage(circuit, rail)
+            level, source = default_voltage(0, circuit.regulator_voltage)
         assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
         taken = taken_words(flight, circuit, throttle, assumed)
         error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(

@@ -143,8 +143,10 @@ def check_cells(full: float, cells: int) -> None:
     """Raise InputError if a pack of this number of cells cannot have this voltage at rest, V."""
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
-            f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: it is '
-            f'likely {counted(cell_count(full) or round(full / 3.7) or 1, "cell")} (lithium)')
+            f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: '
+            + (f'it is likely {counted(likely, "cell")} (lithium)' if (likely := cell_count(full))
+               else 'no number of lithium cells fits') + '; for lead-acid, or a rail that is no '
+            'battery, leave --cells out and give --brownout-voltage V')
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:

@@ -150,15 +150,15 @@ class Design:
     assumed: bool = False  # Whether the battery resistance is assumed: shares of it are shown.
 
 
-def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
-    """Return the brown-out level of a rail and its source (result in V)."""
-    if rail == 'bus':
-        return CELL_BROWNOUT * network.cells, f'{CELL_BROWNOUT} V per LiPo cell'
+def default_voltage(cells: int, regulated: float) -> tuple[float, str]:
+    """Return the brown-out level of a pack, or without cells of a rail, V, and its source."""
+    if cells:
+        return CELL_BROWNOUT * cells, f'{CELL_BROWNOUT} V per LiPo cell'
     for voltage, level in REGULATED_BROWNOUT.items():
-        if math.isclose(network.regulator_voltage, voltage, rel_tol=0.01):
+        if math.isclose(regulated, voltage, rel_tol=0.01):
             return level
     raise ValueError('there is no default brown-out voltage for a regulated rail of '
-                     f'{network.regulator_voltage:g} V: give one (--voltage)')
+                     f'{regulated:.4g} V: give one (--voltage)')
 
 
 def with_capacitance(network: PowerNetwork, capacitance: float,
@@ -291,12 +291,14 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
     bulk = network.bulk_capacitance
     unit, ohm = ('%', 100.0) if found.assumed else ('mOhm', 1e3 * network.battery_resistance)
     packs = next((n for n in range(1, _PACKS + 1) if resistance(1.0 / n) <= target), math.nan)
+    source = 'battery and lead resistance' if network.cells else 'source resistance'
     return (
         Lever('bulk capacitance', 'uF', 1e6 * bulk, 2e6 * bulk, at(2.0 * bulk).risk,
               1e6 * bulk if found.present.risk <= target else
               math.nan if least is None else 1e6 * least.capacitance),
-        Lever('packs in parallel', '', 1.0, 2.0, resistance(0.5), packs),
-        Lever('battery and lead resistance', unit, ohm, 0.75 * ohm, resistance(0.75),
+        *([Lever('packs in parallel', '', 1.0, 2.0, resistance(0.5), packs)]
+          if network.cells else []),
+        Lever(source, unit, ohm, 0.75 * ohm, resistance(0.75),
               ohm * _share(resistance, _RESISTANCE, target)),
         Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, limit(0.8),
               100.0 * throttle * _share(limit, 0.0 if flown is not None else _THROTTLE, target)))
@@ -379,7 +381,7 @@ def answer(result: Design) -> str:
     ratio = result.resistance / result.network.battery_resistance
     cure = ('The mean is above the level with less than ' + (
         f'{percent(ratio)} of the resistance.' if result.assumed else
-        f'{1e3 * result.resistance:.3g} mOhm of battery and leads.')
+        f'{1e3 * result.resistance:.3g} mOhm of {result.levers[-2].name}.')
             if math.isfinite(result.resistance) else
             'The level is at or above the open-circuit voltage: check cells and battery_voltage, '
             'or lower the level.' if result.rail == 'bus' else
@@ -395,9 +397,10 @@ def _others(result: Design) -> str:
              if math.isfinite(lever.least) and lever.least != lever.present]
     if found:
         return 'What would help: ' + ', or '.join(found) + '.'
-    return (f'Neither {_PACKS} packs in parallel, nor {percent(_RESISTANCE)} of the resistance, '
-            f'nor {percent(_THROTTLE)} of the throttle would be enough: land with more charge '
-            'left, use more cells, or allow a lower voltage.')
+    packs, charge = (f'{_PACKS} packs in parallel, nor ', 'land with more charge left, use more '
+                     'cells, or ') if result.network.cells else ('', '')
+    return (f'Neither {packs}{percent(_RESISTANCE)} of the resistance, nor {percent(_THROTTLE)} '
+            f'of the throttle would be enough: {charge}allow a lower voltage.')
 
 
 def effect(result: Design) -> str:

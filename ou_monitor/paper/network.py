@@ -56,7 +56,7 @@ SOURCES = ('switching', 'flutter', 'mcu')
 def completed(values: dict[str, Any]) -> dict[str, Any]:
     """Return components with derived values: battery voltage from cells, rail of a 1S craft."""
     found = dict(values)
-    if 'cells' in found:
+    if found.get('cells'):
         found.setdefault('battery_voltage', NOMINAL_CELL * found['cells'])
     if found.get('battery_voltage', math.inf) <= PowerNetwork.regulator_voltage:
         # A craft of one cell, such as a Crazyflie.
@@ -72,7 +72,8 @@ def _part(default: Any, unit: str = '', *, zero: bool = False) -> Any:
 class PowerNetwork:
     """Components in SI units; the defaults are a typical 6S multirotor."""
 
-    cells: int = _part(6)  # LiPo cells in series; sets the default brown-out level of the bus.
+    # LiPo cells in series; sets the default brown-out level of the bus. 0: the source is a rail.
+    cells: int = _part(6, zero=True)
     battery_voltage: float = _part(22.2, 'V')  # Open-circuit voltage, V (6 x 3.7 V nominal).
     # Battery, connector and leads, Ohm (a 6S pack of 1.3..2.2 Ah has 20..60 mOhm; PX4
     # assumes 5 mOhm per cell).

@@ -31,7 +31,8 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
               number(1e6 * r.tau), number(r.sigma), number(r.var_inf), _time(r.mean_time),
               probability(r.risk_ou), probability(r.risk_crossing), mark]
              for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
-    name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
+    name = ('regulated rail' if result.rail != 'bus' else
+            'battery bus' if result.network.cells else 'recorded rail')
     subject = (f'{name} at {percent(result.throttle)} throttle: mean {present.mean:.4g} V (sag of '
                f'the bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), '
                f'allowed risk {result.target:g} within {result.horizon:g} s')
@@ -75,7 +76,7 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
     return (f'From the flight: {flight.level:.4g} V open-circuit at its end (by the load '
-            f'model; the risks include its error), {network.cells} '
+            f'model; the risks include its error), {network.cells or "no"} '
             f'cells (highest median of 0.5 s {flight.full:.4g} V; --cells N for others), sag '
             f'{sag:.3g} V (+- {2.0 * se:.2g} V, included in the risks, which are computed as in '
             'analyze, with the sag and noise of each row) and noise '

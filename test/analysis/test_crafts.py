@@ -136,7 +136,7 @@ def test_impossible_cells_are_refused_with_the_likely_number(tmp_path, capsys):
     # Seven cells would be lead-acid, 2.3 V each.
     for cells in ('3', '7', '9'):
         assert main(['analyze', str(path), '--cells', cells]) == 2
-        assert 'it is likely 4 cells' in capsys.readouterr().err
+        assert 'it is likely 4 cells (lithium); for lead-acid' in capsys.readouterr().err
     assert main(['analyze', str(path), '--cells', '4', '--json', '-']) == 0
     found = json.loads(capsys.readouterr().out)
     assert found['craft']['cells'] == 4 and found['craft']['cells_from'] == 'given'

@@ -2,6 +2,7 @@
 
 from argparse import ArgumentTypeError
 import json
+import math
 import re
 
 import numpy as np
@@ -192,6 +193,23 @@ def test_set_values_override_the_flight(flight, capsys):
     assert found['present']['sag'] == pytest.approx(0.025 * 80.0 * 0.5 ** 1.5, rel=0.15)
     assert main(['design', '--from', str(flight), '--set', 'cells=3']) == 2
     assert 'it is likely 4' in capsys.readouterr().err
+
+
+def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
+    """Of 5 V, which falls by 60 mV at full throttle; a number of cells is refused."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(0.0, 1.0, 40), 100)
+    path = tmp_path / 'rail.csv'
+    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
+        f'{k / 100.0:.2f},{5.02 - 0.06 * one + 0.009 * noise:.5f},{one:.3f}\n'
+        for k, (one, noise) in enumerate(zip(u, rng.standard_normal(u.size)))))
+    assert asked(capsys, '--from', path)['brownout_voltage'] == 4.5
+    found = asked(capsys, '--from', path, '--rail', 'regulated', '--brownout-voltage', '4.9')
+    assert found['present']['mean'] == pytest.approx(5.02 - 0.06 * found['throttle'], abs=0.005)
+    assert math.sqrt(found['present']['var_inf']) == pytest.approx(0.009, rel=0.2)
+    assert found['network']['cells'] == 0 and 'packs' not in str(found)
+    assert main(['design', '--from', str(path), '--cells', '1']) == 2
+    assert 'no number of lithium cells fits; for lead-acid, or a rail' in capsys.readouterr().err
 
 
 def test_cells_set_the_voltage(capsys):

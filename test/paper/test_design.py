@@ -119,11 +119,11 @@ def test_without_throttle_there_is_no_noise():
 
 
 def test_default_levels_follow_cells_and_rail():
-    assert default_voltage(PowerNetwork(cells=4, battery_voltage=14.8), 'bus')[0] == 4 * 3.3
-    assert default_voltage(PowerNetwork(), 'regulated')[0] == 4.5
-    assert default_voltage(PowerNetwork(regulator_voltage=3.3), 'regulated')[0] == 2.88
+    assert default_voltage(4, 5.0)[0] == 4 * 3.3
+    assert default_voltage(0, 5.023)[0] == 4.5
+    assert default_voltage(0, 3.3)[0] == 2.88
     with pytest.raises(ValueError, match='regulated rail of 9 V'):
-        default_voltage(PowerNetwork(regulator_voltage=9.0), 'regulated')
+        default_voltage(0, 9.0)
 
 
 @pytest.mark.parametrize('changed, words', [
