@@ -40,6 +40,8 @@ _LOOKS = 900.0 / LOOK
 _POINTS, _STEP, _MOST = 300, 0.5, 1200
 # Samples pushed at once: limits memory.
 _SLICE = 100_000
+# Maximum number of dips that are listed.
+_DEEPEST = 10
 # Usual alarms of pilots, V per cell, about Betaflight's vbat_warning_cell_voltage of 3.5.
 ALARMS = (3.7, 3.6, 3.5, 3.4, 3.3)
 
@@ -54,6 +56,16 @@ class Lowest:
 
 
 @dataclass(frozen=True)
+class Dip:
+    """One dip below a limit."""
+
+    begin_s: float  # time from the first reading to its begin, s
+    lowest_v: float  # V
+    seconds: float  # time below, s
+    throttle: float  # at its lowest reading, 0..1
+
+
+@dataclass(frozen=True)
 class Dips:
     """Dips below a limit; one lasts until a reading exceeds limit plus hysteresis."""
 
@@ -63,6 +75,7 @@ class Dips:
     longest_s: float  # time below in the longest dip, s
     first_s: float = NAN  # time from the first reading to the first dip, s
     brief: int = 0  # dips shorter than a second
+    deepest: tuple[Dip, ...] = ()  # at most `_DEEPEST` dips, the deepest first
 
 
 @dataclass(frozen=True)
@@ -199,7 +212,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
     load, budget, last = _at_the_end(there, limit, monitor)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k]) - began, float(u[k])),
-        None if limit is None else _dips(t - began, v, limit, rise_that_ends(v, u, noise)),
+        None if limit is None else _dips(t - began, v, u, limit, rise_that_ends(v, u, noise)),
         Sag(load.known, noise.flown, THROTTLES, floats(load.sag(THROTTLES)),
             floats(load.sag_se(THROTTLES))),
         noise, Resistance(
@@ -257,7 +270,7 @@ def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonito
         last.budget, limit, asked.brownout_horizon, asked.budget_limit), last
 
 
-def _dips(t: FloatArray, v: FloatArray, limit: float, rise: FloatArray) -> Dips:
+def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, rise: FloatArray) -> Dips:
     begins = dip_begins(v, limit, rise)
     if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)
@@ -266,8 +279,12 @@ def _dips(t: FloatArray, v: FloatArray, limit: float, rise: FloatArray) -> Dips:
     usual = float(np.median(spacing)) if spacing.size else 0.0
     held = np.where(v < limit, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
     seconds = np.add.reduceat(held, begins)
+    deepest, ends = [], [*begins[1:], v.size]
+    for k in np.argsort(np.minimum.reduceat(v, begins), kind='stable')[:_DEEPEST].tolist():
+        at = begins[k] + int(np.argmin(v[begins[k]:ends[k]]))
+        deepest.append(Dip(float(t[begins[k]]), float(v[at]), float(seconds[k]), float(u[at])))
     return Dips(limit, int(begins.size), float(seconds.sum()), float(seconds.max()),
-                float(t[begins[0]]), int((seconds < 1.0).sum()))
+                float(t[begins[0]]), int((seconds < 1.0).sum()), tuple(deepest))
 
 
 def alarms(recording: Recording, cells: int, noise: Noise) -> tuple[Dips, ...]:
@@ -276,4 +293,4 @@ def alarms(recording: Recording, cells: int, noise: Noise) -> tuple[Dips, ...]:
         return ()
     there = supplied(recording, at_ends=True)
     t, rise = there.t - recording.t[0], rise_that_ends(there.voltage, there.throttle, noise)
-    return tuple(_dips(t, there.voltage, cells * one, rise) for one in ALARMS)
+    return tuple(_dips(t, there.voltage, there.throttle, cells * one, rise) for one in ALARMS)

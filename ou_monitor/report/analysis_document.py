@@ -54,6 +54,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
         Facts([*facts(analysis), *_origin(analysis)]),
         Section('What to know before using these numbers', [notes(analysis)]),
         lambda: _over_time(analysis),
+        *_deepest(analysis),
         *_alarms(analysis),
         Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis)]),
         Section('Load levels', _levels(analysis)),
@@ -259,6 +260,18 @@ def _by_throttle(analysis: Analysis) -> Part:
              'brown-out risk']
     # A load that is only on or off leaves most throttles unknown.
     return Table.of_known(heads, [row for row in rows if set(row[1:]) != {UNKNOWN}], left=[0])
+
+
+def _deepest(analysis: Analysis) -> list[Part]:
+    """Return the deepest dips, one by one."""
+    dips = analysis.overview.facts.dips
+    if dips is None or not dips.count:
+        return []
+    rows = [[number(one.begin_s, 4), number(one.lowest_v, 4), number(one.seconds, 2),
+             f'{100.0 * one.throttle:.0f}' if math.isfinite(one.throttle) else UNKNOWN]
+            for one in dips.deepest]
+    return [Section(f'Deepest dips below {dips.limit_v:g} V', [Table.of_known(
+        ['begin, s', 'lowest, V', 'below, s', 'throttle, %'], rows)], folded=True)]
 
 
 def _alarms(analysis: Analysis) -> list[Part]:

@@ -40,6 +40,14 @@ def test_dips_are_runs():
     assert (found.dips.seconds, found.dips.longest_s) == pytest.approx((0.11, 0.09))
     assert (found.lowest.voltage_v, found.lowest.time_s) == (8.0, 9.0)
     assert (found.dips.first_s, found.dips.brief) == (5.0, 3)
+    # The deepest first, at the throttle of its lowest reading; of equal ones the first.
+    u = np.arange(2000) / 2000.0
+    listed = supply_facts(Recording(np.arange(2000) / 100.0, v, u), 9.5).dips.deepest
+    assert [(one.begin_s, one.lowest_v, one.throttle) for one in listed] == [
+        (9.0, 8.0, 0.45), (5.0, 9.0, 0.25), (7.0, 9.0, 0.35)]
+    assert [one.seconds for one in listed] == pytest.approx([0.01, 0.09, 0.01])
+    v[::20] = 9.0
+    assert len(supply_facts(Recording(np.arange(2000) / 100.0, v, u), 9.5).dips.deepest) == 10
 
 
 def test_usual_alarms_of_a_pack():
