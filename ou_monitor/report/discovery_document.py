@@ -159,8 +159,8 @@ def _under_load(finding: Finding) -> str:
         return ''
     factor, unit = (finding.full, ' A') if load == 'current' else (1.0, '')
     low, high = (number(factor * end, 2) + unit for end in (fall.low, fall.high))
-    found = (f'The median voltage at {load} of {high} or more is {number(fall.measured, 2)} V '
-             f'lower than at {low} or less (drift included); the model gives '
+    found = (f'Where {load} is {high} or more, the median voltage is {number(fall.measured, 2)} V '
+             f'lower than where it is {low} or less (drift included); the model gives '
              f'{number(fall.explained, 2)} V'
              + ('.' if fall.fits else ': trust the readings.'))
     if dips.count and dips.made is not None:

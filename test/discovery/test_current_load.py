@@ -45,7 +45,7 @@ def test_the_measured_current_is_the_load_where_it_says_more():
     assert any('load is the measured current' in note for note in found.notes)
     shown = ' '.join(terminal(discovery_document(found)).split())
     assert 'throttle' not in shown.replace('better than throttle', '')
-    assert re.search(r' V from current [0-9.]+ A to [0-9.]+ A', shown)
+    assert re.search(r'Where current is [0-9.]+ A or more, .* it is [0-9.]+ A or less', shown)
     with pytest.raises(InputError, match='current'):
         model_text(found, recording)
     alone = discover(Recording(T, v, u, 'made'))
