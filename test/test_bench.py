@@ -1,6 +1,7 @@
 """The commands as functions: JSON, tables, plots and HTML, and missing packages."""
 
 import copy
+from dataclasses import replace
 import json
 import pickle
 import re
@@ -261,3 +262,13 @@ def test_a_model_without_throttle_writes_none(tmp_path):
     assert list(drawn.to_dict()['topics']) == ['/voltage'] and not drawn.recording.has_throttle
     assert simulate(model, duration=2.0, rate=100.0, throttle=0.4).recording.has_throttle
     assert simulate(preset='idle', duration=2.0).recording.has_throttle
+
+
+def test_times_of_compare_count_from_the_first_sample():
+    """Stamps are dates; the second half is simulated."""
+    supply = read_recording(FLIGHT, end=20.0)
+    dated = replace(supply, t=supply.t + 1.7e9)
+    plot = compare(dated, seeds=20).plots()['Voltage, measured and simulated']
+    low, high = (end(np.concatenate([curve.x for curve in plot.curves])) for end in (
+        np.min, np.max))
+    assert (low, high) == pytest.approx((10.0, 20.0), abs=0.1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.comparison.yardstick import Agreement, LEVEL, Likeness
+from ou_monitor.records import FloatArray
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
@@ -88,12 +89,18 @@ def _path(found: Agreement) -> list[tuple[str, str]]:
             *worst]
 
 
+def _since_start(found: Agreement) -> tuple[FloatArray, float]:
+    """Return the times of the traces since the first sample, s, and the stamp of that sample."""
+    begin = float(found.traces.t[0]) - found.simulated[0]
+    return found.traces.t - begin, begin
+
+
 def _voltage(found: Agreement) -> Plot:
     at = found.traces
     plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300)
-    # From its start, as on the other pages: stamps may be dates.
-    t = at.t - at.t[0]
-    plot.band(at.at - at.t[0], at.low, at.high, 'simulated, 95 %', _SIMULATED)
+    # Since the first sample, as on the other pages: stamps may be dates.
+    t, begin = _since_start(found)
+    plot.band(at.at - begin, at.low, at.high, 'simulated, 95 %', _SIMULATED)
     plot.line(t, at.simulated, 'one simulation', _SIMULATED, 'faint')
     plot.line(t, at.voltage, 'measured', 0)
     for level in found.levels:
@@ -106,7 +113,7 @@ def _others(found: Agreement) -> list[Part]:
     drawn: list[Part] = []
     if np.isfinite(at.throttle).any():
         drawn.append(Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
-            at.t - at.t[0], at.throttle, '', 2)))
+            _since_start(found)[0], at.throttle, '', 2)))
     beside = []
     if at.response.size:
         plot = Plot(f'Mean response to {found.rises} rises of throttle', 'time since the rise, s',
