@@ -21,10 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
+from ou_monitor.recordings.importers.csv_cells import (
+    AMPERE_WORDS, CHANNEL, clock_times, factor_of, first_word, has_day, is_clock, is_missing,
+    is_number, is_value, number_of, SCALES, SHARE_WORDS, shown, TIME_WORDS, unit_of,
+    VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
-    AMPERE_WORDS, CHANNEL, clock_times, factor_of, first_word, Form, form_of, has_day,
-    has_unit_beside, is_clock, is_missing, is_number, is_value, number_of, numbers, SCALES,
-    SHARE_WORDS, shown, THROTTLE, TIME, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE, WORDS)
+    Form, form_of, has_unit_beside, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -409,10 +411,15 @@ def _finest(form: Form, first: int) -> int:
              if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
              and not re.search(
                  'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
-    # A time with decimals is finer than a clock of whole seconds.
-    finer = [k for k in named if any('.' in cell and is_number(cell) for cell in form.cells(k))
-             ] if all(re.search(r':\d\d:\d\d$', cell) for cell in form.cells(first)) else []
-    return next((k for k in (*finer, first, *named) if _rises(form, k) and (
+    # A time with decimals and a unit is finer than a clock of whole seconds.
+    whole = all(re.search(r':\d\d:\d\d$', cell) for cell in form.cells(first))
+    finer = [k for k in named if whole and form.units[k] in TIME_WORDS and any(
+        '.' in cell and is_number(cell) for cell in form.cells(k))]
+    # A new start falls to the first time or below it; a late line does not, and is sorted later.
+    t = _times(form, first)
+    anew = bool(((np.diff(t)[1:] < 0.0) & (t[2:] <= t[0])).any()) if t.size else False
+    return next((k for k in (*finer, first, *named) if (
+        not anew if k == first else _rises(form, k)) and (
         2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)), first)
 
 
@@ -457,12 +464,16 @@ def _steadiest(form: Form, places: list[int]) -> list[int]:
     return [places[k] for k in able] if least else []
 
 
+def _times(form: Form, place: int) -> FloatArray:
+    """Return the times in a column in the first rows: numbers as written, clocks in s."""
+    cells = form.cells(place)
+    return np.array([number_of(cell)[0] for cell in cells]) if all(map(is_number, cells)) else (
+        clock_times(Path(), cells, form.names[place], []))
+
+
 def _rises(form: Form, place: int) -> bool:
     """Return whether the times in a column never fall in the first rows."""
-    cells = form.cells(place)
-    times = [number_of(cell)[0] for cell in cells] if all(map(is_number, cells)) else (
-        clock_times(Path(), cells, form.names[place], []))
-    return not (np.diff(times) < 0.0).any()
+    return not (np.diff(_times(form, place)) < 0.0).any()
 
 
 def _unit_column(form: Form, place: int, unit: str | None) -> _Column:

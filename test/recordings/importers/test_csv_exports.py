@@ -714,12 +714,25 @@ def test_facts_and_a_title_above_rows_without_names(tmp_path):
     np.testing.assert_allclose(found.voltage, V)
 
 
+def test_a_late_line_does_not_change_the_time(tmp_path):
+    """Another time that only rises is no reason to leave the one that is named best."""
+    t = 0.1 * K
+    t[[20, 21]] = t[[21, 20]]
+    found = read_recording(written(tmp_path, table(
+        ['time_s,voltage_v,charge_time_s'], lambda k: f'{t[k]:.1f},{V[k]},{2 * k}')))
+    np.testing.assert_allclose(found.t, 0.1 * K)
+    assert any('later stamp' in note for note in found.notes)
+
+
 def test_a_time_with_decimals_is_finer_than_a_clock(tmp_path):
     """Arbin, once a second: dates are cut to whole seconds."""
     path = written(tmp_path, table(
         ['Data_Point,Test_Time(s),Date_Time,Step_Time(s),Voltage(V)'],
         lambda k: f'{k},{1.0 - 1e-4 + k:.5f},{clock(k, "%Y-%m-%d %H:%M:%S", 1.0)},0.5,{V[k]}'))
     np.testing.assert_allclose(read_recording(path).t, K + 1.0 - 1e-4)
+    # Without a unit it may be in minutes.
+    path = written(tmp_path, path.read_text().replace('Test_Time(s)', 'Test_Time'))
+    assert read_recording(path).t[0] > 1e9
 
 
 def test_blank_lines_around_names_and_units(tmp_path):
