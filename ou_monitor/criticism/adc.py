@@ -146,7 +146,7 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _leans_up(below: FloatArray, codes: int, step: float) -> bool:
-    """Return whether the code above the most frequent top code is fuller than the code below."""
+    """Return whether the code above the fullest of the top codes is fuller than the one below."""
     # Noise after clipping lowers as many readings as it raises.
     count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
     full = max(range(codes), key=lambda k: count[k])
@@ -308,9 +308,9 @@ def _in_long_runs(v: FloatArray) -> npt.NDArray[np.bool_]:
 
 def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     """Return the share of ties between neighbours that is expected without holds."""
-    # Values k samples apart are equal by chance of their codes, or with probability h^k if a share
-    # h of the samples is held.  By chance, neighbours are equal more often, by the ratio of the
-    # rms differences at lags k and 1: sqrt(k) in a diffusion, less in white noise.
+    # If a share h of the samples is held, values k samples apart are equal with probability h^k;
+    # other ties are chance.  Chance ties between neighbours are likelier by the ratio of the rms
+    # differences at lags k and 1: sqrt(k) in a diffusion, less in white noise.
     near = float(np.mean((v[1:] - v[:-1]) ** 2))
     shares = []
     for k in _APART:

@@ -37,8 +37,8 @@ class FoundRecording:
 
     path: Path  # File, or folder of a bag; absolute, links resolved
     files: tuple[Path, ...]  # Its data files, in order of name
-    size: int  # Bytes in them
-    stamp: tuple[int, ...]  # Times of their last changes, ns
+    size: int  # Bytes of data
+    stamp: tuple[int, ...]  # Time of the last change, ns, and size of each file, metadata included
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class _Search:
 
 def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
           ) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield as os.walk does, to a limited depth: os.walk recurses for each level."""
+    """Yield as os.walk does, to a limited depth, because os.walk recurses into each folder."""
     for folder, inner, names in os.walk(root, onerror=onerror):
         if folder.count(os.sep) - str(root).count(os.sep) >= _MOST_DEPTH and inner:
             inner.clear()

@@ -176,7 +176,7 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
     """Return all rows of the table, and notes on vehicles, flights and damage."""
-    # A copy belongs to the vehicle named by its content, else by its own path.
+    # The vehicle of a copy is named by its content, else by the path of the copy.
     whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
     vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)
     starts = {path: r.get('start', NAN) for path, r in results.items() if not r['error']}

@@ -64,7 +64,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             if not by_pattern:
                 unmatched.append(path)
         elif path.parent in named:
-            # Other recordings in the folder name their vehicles: the folder's name is not one.
+            # Other recordings in the folder name their vehicles, so its name is not a vehicle's.
             found[path] = Vehicle('', FOLDER)
             mixed.append(path)
         else:
@@ -114,8 +114,8 @@ def _rule_counts(found: Mapping[Path, Vehicle]) -> str:
         of_kind = [v for v in found.values() if v.named_by == kind and v.name]
         if of_kind:
             count = len({v.name for v in of_kind})
-            parts.append(f'{counted(len(of_kind), "recording")} to {counted(count, "vehicle")} '
-                         f'{text}')
+            parts.append(f'{counted(len(of_kind), "recording")} assigned to '
+                         f'{counted(count, "vehicle")} {text}')
     return 'Vehicles: ' + ('; '.join(parts) if parts else 'none identified') + '.'
 
 

@@ -3,8 +3,8 @@ Run tasks in many processes: on this machine, or on the workers of a Dask schedu
 
 Local processes are reached over pipes, so no port is open.  Only this module imports Dask.
 
-Limits: if a local worker dies, the tasks running on all local workers are lost.  Any of them may
-have used up the memory for which it was killed, so each is tried once more, alone.
+Limits: if a local worker dies, the running tasks of all local workers are lost.  Any of them may
+have exhausted the memory, so each is tried once more, alone.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from operator import mul
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Number of products, and of levels of pairwise products, between two normalisations.  So few do
-# not underflow, because the largest density of each sample is scaled to 1.
+# Number of products, and of levels of pairwise products, between two normalisations: too few to
+# underflow, because the largest density of each sample is scaled to 1.
 _EVERY, _LEVELS = 8, 3
 # Samples per block, relative to the square root of the number of samples: below 1, because a step
 # within the blocks (arrays) costs more than a step from block to block (plain Python).

@@ -42,7 +42,7 @@ class Filter:
     """Kalman filter of a model.  Raises ValueError if a covariance is singular or not finite."""
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
-        # Samples to filter; after the samples of the model, matrices and gain are constant.
+        # Number of samples to filter; after those of the model, matrices and gain are constant.
         self._n = model.f.shape[0] if n is None else n
         # Number of samples with their own gain, and number of states.
         self.shape = (model.f.shape[0], model.f.shape[1])
@@ -90,7 +90,7 @@ class Filter:
             for i, j in np.argwhere(_pattern(loop)).tolist():
                 band[first - 1:end - 1, j, d + i - j] = -loop[i, j, first - begin:]
             if end - begin > 1:
-                # As for the constant gain in __init__, the last sample but one.
+                # Of the last sample but one, as the gain in `__init__`.
                 self._last_loop = loop[..., -2].copy()
         self._band_of_loop = band.reshape(n * d, 2 * d).T
         return variance
@@ -112,7 +112,7 @@ class Filter:
         return self._states(columns)[0]
 
     def _states(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return innovations and filtered states of the solved samples."""
+        """Return innovations and filtered states of samples with their own gain."""
         n, p = columns.shape
         d = self._gain.shape[1]
         right = (self._gain[:, :, None] * columns[:, None, :]).reshape(n * d, p)

@@ -1,8 +1,8 @@
 """
-The voltage of a battery under load, from throttle or current, and start values for a next flight.
+The voltage of a battery under load, from throttle or current; start values for the next flight.
 
 Limits: the form and its constants were chosen on nine recordings (doc/load.md); charge is computed
-from the load, so with throttle, wind and payload cause errors; all motors follow one law.
+from the load, so if only throttle is known, wind and payload cause errors; all motors are alike.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
 x = ul^p (E/3.8)^(p-1) exp(-2 h), ul = LP(u, lag), dq = x dt / (mean x T), dh = (sag/V) dq,
@@ -225,7 +225,7 @@ class LoadStart:
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> LoadStart:
-        """Return the start with the entries of a model file."""
+        """Return the start values in a model file."""
         names = [f.name for f in fields(cls)]
         for name in values:
             if name not in names:
@@ -268,11 +268,11 @@ def _numbers(value: Any) -> Any:
 
 def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
     """Return prior mean and covariance of the coefficients, and mean sag, each per volt."""
-    # The coefficients are S b with a log-normal S, median 0.12.  In b, the share that lags by 60
-    # ms is beta(0.5, 1), the share that lags by 0.35 s normal(0.05, 0.1), the coefficients of u
-    # and u^3 are normal(0, 0.2), of u after a lag normal(0, 0.1), and the others log-normal.  The
-    # coefficient of x is 1, less the two shares and 0.7 times the coefficients of u and u^3; the
-    # coefficient of x after a lag includes -0.7 times the coefficient of u after that lag.
+    # The coefficients are S b, with a log-normal S of median 0.12.  Priors of the parts of b:
+    # - x after 60 ms: beta(0.5, 1); x after 0.35 s: normal(0.05, 0.1);
+    # - u and u^3: normal(0, 0.2); u after a lag: normal(0, 0.1); the others: log-normal;
+    # - x: 1, less the parts of x after 60 ms and 0.35 s, less 0.7 times the parts of u and u^3.
+    # The coefficient of x after a lag includes -0.7 times the part of u after that lag.
     # The deviations were chosen among six sets (0.1 to 0.3 for 0.35 s, 0.07 to 0.2 for u after a
     # lag) on twelve recorded flights; their errors one second ahead differ by less than 1 %.
     def lognormal(median: float, deviation: float) -> tuple[float, float]:

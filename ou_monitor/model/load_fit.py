@@ -32,19 +32,19 @@ _PRIOR = {
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
-# Deviations and centres that differ if the load is a current, whose scale and use are unknown.
+# Prior deviations and centres for a current, whose scale and use are unknown.
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
 # Prior deviation of a constant level, V per cell (it replaces the charge).
 _LEVEL_SD = 0.2
-# Search for the delay of the load: number of shifts tried to each side, and maximum delay, s;
-# ratio of the squared residuals below which the delay is used; time constants, s, of the high-pass
-# that removes trends and of the lag with which the load enters a second time.
+# Search for the delay of the load.  Number of shifts tried to each side; maximum delay, s; ratio
+# to which a delay must reduce the squared residuals; time constants, s, of the high-pass that
+# removes trends, and of the low-pass for the second regressor.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
-# Before a fit, the data are averaged over bins of this time, s (OU and polarisation are slower),
-# or this share of a short recording; minimum number of samples.
+# Bins over which the data are averaged before a fit: width, s (OU and polarisation are slower),
+# and maximum share of the recording.  Minimum number of samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
 # The slow error of the load model is an OU: its time constant, s, and the standard deviations
 # tried, V per cell (doc/load.md explains the maximum).

@@ -54,8 +54,8 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
-# Minimum gap, in median steps (below it, splitting the data would cost more than the error in
-# time); minimum number of readings between gaps.
+# Minimum gap, in median steps: to split the data at smaller ones would cost more accuracy than
+# their error in time.  Minimum number of readings between gaps.
 _GAP, _STRETCH = 5.0, 16
 # Minimum share of the readings that pieces of equal length must contain.
 _HELD = 0.8
@@ -68,11 +68,11 @@ FEWEST = 40
 # Maximum number of elements in an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
 # Number of points of the first grid in ln(alpha dt), logit(share of the OU) and ln(walk); ends of
-# the logit.  The upper end is close to share 1, because at alpha dt = 0.004 white noise of 1e-3
+# the logit.  The upper end is close to a share of 1: at alpha dt = 0.004, even white noise of 1e-3
 # of the variance is half of the spectrum at the highest frequency.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
 # For the bounds: further points in logit(share) about the best of the grid, and successive steps
-# in ln(walk) that refine it.
+# in ln(walk) that refine the walk.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
 # Size of the noise: time constants, s, of the lagged loads whose differences are predictors;
@@ -82,8 +82,8 @@ _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 _LOOKS, _NEAR = 40, 0.05
 # Draws in each round, over all maxima; rounds; minimum share of the draws for a maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
-# A minimum of the cost at another alpha is refined, and then kept, if it exceeds the lowest by
-# less than these, nats (e^-6 of the likelihood does not affect a 95 % interval).
+# Maximum excess of a minimum at another alpha over the lowest cost, nats: to be refined, and then
+# to be kept (e^-6 of the likelihood does not affect a 95 % interval).
 _REFINED, _RIVAL = 10.0, 6.0
 # A window is imprecise above this standard deviation of ln(alpha) (from the curvature at the
 # maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.
@@ -262,7 +262,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
             left = left - (basis @ left) @ basis
         left = left * size
     if law.follows and left.any():
-        # The weighted residual gets the variance of the residual, even if `law` is wrong.
+        # Scale the size so that weighting keeps the variance, even if `law` is wrong.
         size = size * math.sqrt(float(np.sum((left / size) ** 2)) / float(left @ left))
     return Regression(dt, places, left, size, basis, [s.stop - s.start for s in parts],
                       walk, 0.5 * float(knots[1] - knots[0]))
@@ -270,7 +270,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 def _innovations(x: FloatArray) -> FloatArray:
     """Return the innovations of an AR(1)."""
-    # `NoiseSize` assumes independent values: fitted to a slow OU, it would follow chance.
+    # `NoiseSize` assumes independent values: fitted to a slow OU, it would follow its excursions.
     power = float(x @ x)
     phi = float(x[1:] @ x[:-1]) / power if power > 0.0 else 0.0
     return x - phi * np.append(x[:1], x[:-1])

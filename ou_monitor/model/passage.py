@@ -257,7 +257,7 @@ def tridiagonal(bands: FloatArray, right: FloatArray, far: FloatArray) -> FloatA
     # bands: below, on and above the diagonal, shape (3, n, systems); right: (n, systems).
     low, main, high = bands
     p, q = np.empty_like(right), np.empty_like(right)
-    # Replace x[-1] in the last row by its three neighbours; eliminate the farthest first.
+    # In the last row, replace x[-1] by the three x before it; eliminate the farthest first.
     last = high[-1] * far[:, None]
     main[-1] += last[2]
     low[-1] += last[1]
@@ -295,7 +295,7 @@ def _log_rate(b: FloatArray) -> FloatArray:
     # D is the parabolic cylinder function.  For 0 < b <= 8, nu comes from the power series of the
     # Hermite function, in which only the first term is negative: nu = 2 Gamma(1 - nu/2) / sum over
     # n >= 1 of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, it comes from the asymptotic
-    # series of the mean time, 1/nu; for b <= 0, it is the lowest energy above a wall.
+    # series of the mean time, 1/nu; for b <= 0, from `_lowest_energy`.
     result = np.empty(b.size)
     n = range(1, 260)
 

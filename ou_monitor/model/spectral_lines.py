@@ -45,7 +45,7 @@ _LONGEST = 1 << 20
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
 # Number of nearest ordinates on each side that a line must exceed, and maximum p-value of this
-# comparison (about 0.003 for the weakest line that is detected).
+# comparison; the weakest detected lines have about 0.003.
 _BESIDE, _UNLIKE = 8, 0.05
 # Maximum ratio of samples after interpolation to samples given.
 _FILLED = 4.0
@@ -198,7 +198,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
     if not wide:
-        # In a hump, unlike a comb, many adjacent ordinates are high: multiply by their number.
+        # A hump, unlike a comb, has many high ordinates side by side: multiply p by their number.
         count = np.searchsorted(hits, hits + NEIGHBOURS) - np.searchsorted(hits, hits - NEIGHBOURS)
         hits = hits[_beside(white, where[hits], k) * count < _UNLIKE]
     p = np.ones(where.size)

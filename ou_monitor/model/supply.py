@@ -22,9 +22,9 @@ from ou_monitor.records import FloatArray
 # of all terms in the processor's caches.
 SEGMENT = 15_000
 
-# Size of an array that is allocated and freed once, after which the GNU allocator keeps the memory
-# of segments for reuse.  Otherwise it would return it to the system and request it again page by
-# page, which can take longer than the arithmetic.
+# Size of an array that is allocated and freed once.  The GNU allocator then keeps freed memory for
+# reuse.  Otherwise each segment would request its memory anew from the system, page by page, which
+# can take longer than the arithmetic.
 _KEPT = 2**18
 
 # Relative difference below which steps count as equal, because stamps are rounded.
@@ -36,7 +36,7 @@ class SupplyModel:
     """
     Terms that add up to a supply.
 
-    Raises ValueError if the first term is not `ou`, or if a term occurs twice that may not.
+    Raises ValueError if the first term is not `ou`, or a term without `SEVERAL` occurs twice.
 
     Examples
     --------
@@ -121,7 +121,7 @@ class Discharge:
         self.charge = self._origin if math.isnan(charge) else charge
 
     def __call__(self, s: Segment) -> None:
-        """Lower the level by the charge that throttle draws in a segment."""
+        """Lower the level as throttle draws charge in a segment."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
         left = self.charge - np.cumsum(self._load.discharge * s.throttle ** _POWER * step)
         s.level += self._load.cells * (open_circuit(left) - open_circuit(self._origin))

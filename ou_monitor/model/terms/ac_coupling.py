@@ -38,7 +38,7 @@ class ACCoupling(Term):
     SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
     STATES: ClassVar[int] = 1
     SEVERAL: ClassVar[bool] = True
-    # An instrument may have two corners.
+    # An instrument may have two corners; one alone leaves a part.
     MAY_LEAVE: ClassVar[float] = 0.75
     MEANING: ClassVar[str] = (
         'The instrument is AC-coupled: the relaxation comes from its high-pass.')

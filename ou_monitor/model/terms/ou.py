@@ -13,9 +13,9 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Term
 from ou_monitor.records import FloatArray
 
-# With a nonlinear force, maximum length of the parts of a step, in relaxation times (of the whole
-# force at one standard deviation; the error in law is of second order in it), and maximum number
-# of parts of a step.
+# With a nonlinear force, steps are split into parts: their maximum length, in relaxation times of
+# the whole force at one standard deviation (the error in law is of second order in it), and their
+# maximum number.
 _PART = 0.05
 _PARTS_MOST = 1_000_000
 # Maximum number of parts whose random numbers are stored at once.
