@@ -138,8 +138,8 @@ def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> 
         return _plain(ProcessType.UNDETERMINED, tails.why_not)
     visible = detectable_kurtosis(shape.n)
     if visible > VISIBLE_KURTOSIS:
-        return _plain(ProcessType.UNDETERMINED, 'no test rejects, but so few samples cannot '
-                      'reveal heavy tails',
+        return _plain(ProcessType.UNDETERMINED, 'no test finds a deviation, but so few samples '
+                      'cannot reveal heavy tails',
                       f'{shape.n} samples, excess kurtosis up to {visible:.2g}')
     return _gaussian(estimate, shape, line_share, f'no excess kurtosis above {visible:.2g}')
 
@@ -349,7 +349,7 @@ class LevelResult:
 
     @property
     def doubted(self) -> bool:
-        """Whether one OU in white noise does not describe what was fitted."""
+        """Whether one OU in white noise is a doubtful description of the level."""
         return self.lines_kept or self.shape['one_relaxation'].rejects or self.wanders
 
     @property

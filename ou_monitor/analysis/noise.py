@@ -35,7 +35,7 @@ _STEADY, _STEADY_TIME = 0.02, 0.2
 _WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
-# Minimum time of these readings, s; in a short recording, a share of its duration.
+# Minimum time of these readings, s, and its maximum as a share of the recording.
 _IN_TIME, _IN_SHARE = 0.5, 0.02
 
 
@@ -185,7 +185,7 @@ def _needed_readings(recording: Recording) -> float:
 
 def _over_throttle(u: FloatArray, square: FloatArray, enough: float,
                    beyond: float | None = None) -> tuple[float, ...]:
-    """Return rms, V, interpolated at THROTTLES; outside the measured, `beyond` or the nearest."""
+    """Return rms, V, interpolated at THROTTLES; `beyond` (or the nearest) outside those flown."""
     at, rms = [], []
     for throttle in THROTTLES:
         near = np.abs(u - throttle) <= BAND

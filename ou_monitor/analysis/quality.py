@@ -30,7 +30,7 @@ _UNEVEN = 0.05
 # Maximum voltage of a UAV supply, V; any supply in millivolts exceeds it.
 _MOST_VOLTS = 1000.0
 # Step, s, above which a wrong time unit is suspected (battery messages of autopilots come more
-# often); the same in a recording of more than _LONG_FLIGHT, s.
+# often); a lower one for recordings longer than _LONG_FLIGHT, s.
 _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
 # Tolerance of throttle beyond 0..1 (trim), and maximum share of samples beyond that.
 _TRIM, _RARE = 0.05, 0.01

@@ -64,7 +64,7 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
 # Upper limit of a quantity, so that products stay finite.
 _QUANTITY_MOST = 1e15
-# Upper limits of components of a craft, with a margin: larger numbers lack their prefix.
+# Upper limits of components of a craft, with a margin; a larger number lacks its prefix.
 _PART_MOST = {'F': 10.0, 'H': 1.0, 'Ohm': 100.0}
 _QUANTITY = re.compile(r'([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?', re.ASCII)
@@ -217,7 +217,7 @@ def estimate(voltage: str) -> tuple[Option, ...]:
                help='window of the sliding estimate, s (default: %(default)s)'),
         *limit(voltage),
         Option('--brownout-horizon', metavar='S', type=POSITIVE, default=5.0,
-               help='horizon of that risk, s (default: %(default)s)'))
+               help='horizon of the brown-out risk, s (default: %(default)s)'))
 
 
 class _Help(argparse.HelpFormatter):
@@ -355,7 +355,7 @@ _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
-    'power network, over bulk capacitances, and the smallest one that meets a risk.',
+    'power network, for a range of bulk capacitances, and find the smallest that meets a risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a flight (any recording that analyze '
             'reads); --set overrides it'),
@@ -364,7 +364,7 @@ _DESIGN = Command(
             '%(default)s, as for the throttle budget of analyze)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
-            help='throttle, 0..1 (default with --from: exceeded for 1 %% of it)'),
+            help='throttle, 0..1 (default with --from: exceeded for 1 %% of the flight)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      *limit('brown-out level, V (default: 3.3 V per cell on the bus; 4.5 V on a regulated rail of '
@@ -421,8 +421,8 @@ _FLEET = Command(
      Option('--insecure', action='store_true',
             help='allow a scheduler on another machine without TLS'),
      Option('--vehicle-from', metavar='REGEX',
-            help="finds the vehicle in a recording's path (its first group) if the metadata "
-            'name none (default: its folder)'),
+            help='regular expression whose first group finds the vehicle in the path, if the '
+            'metadata name none (default: the folder is the vehicle)'),
      Option('--discover', action='store_true',
             help='also search for causes; takes a few seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),
@@ -456,8 +456,8 @@ _REPRODUCE = Command(
 
 _SIMULATE = Command(
     'simulate', 'a recording from a model', 'ou_monitor.cli.simulate',
-    'Simulate a recording from a model of a supply, exactly distributed at any rate. --list shows '
-    'the presets and the throttle profiles.',
+    'Simulate a recording from a model of a supply, at any rate. --list shows the presets and the '
+    'throttle profiles.',
     ((Option('--preset', metavar='NAME',
              help="preset to simulate (default 'flight'; --list shows all)"),
       Option('--model', metavar='FILE.yaml', type=path_argument,
@@ -471,14 +471,14 @@ _SIMULATE = Command(
             'throttle, or a recording, whose length is then the default'),
      *PART, *COLUMNS,
      Option('--capacity-left', metavar='X', type=NUMBER,
-            help='initial charge, 0..1; throttle then discharges the battery, in place of drift; '
-            "-1: the charge at the start of the model's recording"),
+            help='initial charge, 0..1; the battery then discharges by throttle, not by the term '
+            "drift; -1: the charge at the start of the model's recording"),
      Option('--scale-resistance', metavar='X', type=NUMBER, default=1.0,
             help='factor on the response to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),
      Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
-            help='print the model in the parameters of another simulator, and the effects that it '
-            'cannot express over --throttle: gazebo, px4, ardupilot, json'),
+            help='print the model in the parameters of another simulator, and what these omit '
+            'under --throttle: gazebo, px4, ardupilot, json'),
      Option('--full-current', metavar='A', type=POSITIVE, default=math.nan,
             help='with --export: current at full throttle'),
      Option('--output', metavar='PATH', type=path_argument,

@@ -105,8 +105,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         far = 1e3 * float(np.ptp(v))
         exact.append(Saturation(low if math.isfinite(low) else float(v.min()) - far,
                                 high if math.isfinite(high) else float(v.max()) + far))
-        notes.append(f'{int(drawn.sum())} samples at the end of the range were replaced by '
-                     'random draws beyond it, from a model of the others.')
+        notes.append(f'{int(drawn.sum())} clipped samples were replaced by random draws beyond '
+                     'the limit, from a model of the other samples.')
     cell = _judge_step(step, innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes

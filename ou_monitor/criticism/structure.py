@@ -102,8 +102,8 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     run = _filter(samples, terms, events)
     mean = mean_of(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
-    # Exclude the event at the sample itself: its law predicts it.  Only the fit of the Gaussian
-    # part, which has no laws, includes it.
+    # Exclude the event at each sample, because a law predicts it.  Only the fit of the Gaussian
+    # part, which has no laws, includes the event.
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        run.segment.phi, run.cost)
@@ -113,8 +113,9 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              events: Events | None = None, offset: FloatArray | None = None, *,
              own: bool = False) -> FloatArray:
     """Return voltage, level and columns of the mean, whitened by the noise of a model."""
-    # With `own`: the columns of the model's terms, then of `more`.  Without: only of `more`, and
-    # terms of the model that are not `MEASURED` are subtracted from the voltage.  offset in V.
+    # own: return the columns of the model's terms, then of `more`.  Otherwise return the columns
+    # of `more`, and subtract the model's terms that are not `MEASURED` from the voltage (and
+    # `offset`, V, in both cases).
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     columns = columns_of(samples, (*kept, *more), run.segment)
@@ -336,8 +337,8 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         gain = float(better.density.sum()) - value
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
-        # A step that gains what the parabola predicts has reached the maximum, within about the
-        # difference.  A full fit goes on, because its errors need the slopes at the maximum.
+        # If a step gains what the parabola predicts, the maximum is reached.  A full fit goes on,
+        # because its errors need the slopes at the maximum.
         if gain < (_NEARLY if rough else _SETTLED) or (
                 rough and abs(gain - predicted) < _NEARLY):
             break

@@ -351,7 +351,7 @@ class AdaptiveFilterNode(MonitorNode):
             return (f'fmin, {s.lowest:.4g} Hz by max_lag ({s.max_lag:g} degrees at '
                     f'{s.lag_frequency:g} Hz)')
         if bound in (Bound.SLEW, Bound.SMOOTHING):
-            aim = (f'the {low_pass.wanted:.4g} Hz wanted' if math.isfinite(low_pass.wanted) else
+            aim = (f'{low_pass.wanted:.4g} Hz' if math.isfinite(low_pass.wanted) else
                    f'the fallback, because {_unknown(supply)}')
             return f'{bound.value}, on the way to {aim}'
         return bound.value
@@ -361,8 +361,8 @@ class AdaptiveFilterNode(MonitorNode):
         age = self._input_silence.age
         if self._channels is None and self._found:
             return Level.WARN, (
-                f"Cannot filter {self._topic} of type {', '.join(self._found)}: "
-                f"{', '.join(CHANNELS)} only, or name its signal with input.field.")
+                f"Cannot filter {self._topic} of type {', '.join(self._found)}: name its signal "
+                f"with input.field; only {', '.join(CHANNELS)} need no name.")
         if self._channels is None:
             return Level.STALE, f'Waiting for a publisher on {self._topic}.'
         if age is None or age > max(s.stale_after, SLOW_MISSED * self._input_interval.value):

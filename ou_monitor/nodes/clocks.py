@@ -210,7 +210,7 @@ class SimClockMap:
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[float, float]] = deque(maxlen=PAIRS)
-        # Slope, and the value at the first pair less its clock, s.
+        # Slope of the line, and its value at the first pair less the clock of that pair, s.
         self._rate = self._off = 0.0
 
     @property

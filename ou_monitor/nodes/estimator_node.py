@@ -87,7 +87,8 @@ class EstimatorNode(MonitorNode):
         self._watched = PublisherWatch(self)
         self._settled = 0
         self._console = Console(self)
-        # When the next estimate is due, and the load of pushing samples as a share of the time.
+        # When the next estimate is due, and the times of the last outputs, s; below, CPU time of
+        # pushing samples, s, and the time since which it is counted.
         self._due = self._published = self._diagnosed = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
         self._handed_over = -math.inf

@@ -30,8 +30,8 @@ class Channels:
 
     names: tuple[str, ...]  # Signals, one low-pass each
     fields: tuple[FieldPath, ...]  # Where each is in the message
-    # Covariance of the signals, which stays unchanged; its first element is -1 if the message does
-    # not have them.
+    # Covariance of the signals, which stays unchanged; its first element is -1 if the message
+    # lacks the signals.
     covariance: FieldPath | None = None
     output: str = ''  # Type of the output; empty: the type of the input
     # Makes the output of a message and filtered values; None: the values replace the signals.

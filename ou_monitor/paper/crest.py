@@ -122,7 +122,7 @@ def rows(crests: Crests) -> list[Row]:
     for state in published.LOADED:
         value, inputs = state.crest, state.crest_range
         beyond = ('' if inputs[0] <= crests.band[1] else
-                  f'; the lowest would need a screen of {screen_for(inputs[0]):.2g} s')
+                  f'; even {inputs[0]:.1f} would need a screen of {screen_for(inputs[0]):.2g} s')
         found.append(Row(
             'Table 1', f'Vpp/Vrms, {state.label}', '', Printed(f'{value:.1f}'), mean,
             f'OU with tau {published.TAU_MS.text} ms sampled at 1 MHz, {count} segments of '

@@ -43,7 +43,7 @@ class ModelFile:
 
 @one_line()
 def read_model(path: str | Path) -> ModelFile:
-    """Read a model file (a node needs a thread: the largest, 1 MB, takes 2 to 5 s)."""
+    """Read a model file; the largest, 1 MB, takes 2 to 5 s, so a node needs a thread for it."""
     return parse_model(read_yaml(path, 'the model file'), path_words(path))
 
 

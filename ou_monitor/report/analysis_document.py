@@ -147,7 +147,7 @@ def _why_no_throttle(analysis: Analysis) -> str:
     """Return why no throttle is safe: last reading, flight before, or voltage at rest."""
     rest, last = analysis.overview.load.level, float(analysis.recording.voltage[-1])
     if last < analysis.by_throttle.voltage < rest:
-        return f'at the end of this recording, which reads {number(last, 4)} V'
+        return f'at the end of this recording, where the voltage is {number(last, 4)} V'
     if rest > analysis.by_throttle.voltage:
         return f'right after this flight, though the supply at rest is at {number(rest, 4)} V'
     return f'even at idle, as the supply at rest is at {number(rest, 4)} V'
@@ -396,9 +396,9 @@ def _process(analysis: Analysis) -> list[Part]:
     return [
         lambda: [Table(['throttle', *_TESTS.values()], rows, left=[0]), Text(
             'p-values, Holm-adjusted over all tests of all levels; below each, the effect size. '
-            '* marks a rejection: p below 0.01 and an effect large enough to matter. With '
-            'stationary OU levels, one recording in a hundred shows a rejection other than '
-            '"Correlated"; "Correlated" rejects wherever the supply relaxes.')],
+            '* marks a rejection: p below 0.01 and an effect large enough to matter. Every supply '
+            'that relaxes is "correlated"; with stationary OU levels, one recording in a hundred '
+            'shows any other rejection.')],
         Notes.of(reasons)]
 
 

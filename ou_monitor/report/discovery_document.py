@@ -140,8 +140,8 @@ def _disagreement(finding: Finding, seen: Overview | None) -> str:
         # NaN and infinite bounds compare as false.
         beyond = bool(alpha * supply.tau_below_s < 1.0
                       and ou['sigma'] ** 2 > 2.0 * alpha * supply.var_inf_below)
-        return (' Relaxation counts such slow changes as changes of the level, so its bound '
-                'is lower.') * beyond
+        return (' The bound under Relaxation is lower, because it counts such slow changes as '
+                'changes of the level.') * beyond
     if supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
             Z95 * math.hypot(supply.log_se('alpha'), se / alpha)):
         return ''

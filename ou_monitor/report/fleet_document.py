@@ -106,7 +106,7 @@ def _ageing(fleet: Fleet) -> str:
                  for vehicle in dict.fromkeys(t.vehicle for t in old)]
         more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
         likely = {t.vehicle for t in tested if t.low > 0.0} - {t.vehicle for t in old}
-        also = f'; the 95 % interval of {len(likely)} more lies above 0, too' if likely else ''
+        also = f'; the 95 % interval of {len(likely)} more is also above 0' if likely else ''
         doubt = '' if certain else f'; not certain among {counted(len(judged.trends), "test")}'
         return (f'{"A" if certain else "Possibly a"}geing pack{"s" * (len(words) > 1)} '
                 f'({len(words)} of {len({t.vehicle for t in tested})}{also}): '

@@ -118,8 +118,8 @@ def lines_of(view: View) -> tuple[Line, ...]:
 
 # Maximum number of lines tried; their false-alarm probability, large because evidence decides.
 _MOST, _PROPOSED = 3, 0.5
-# Smaller of two initial linewidths, in resolutions of the recording (the other is the geometric
-# mean of it and the maximum); linewidth, Hz, from which a line's amplitude must be constant.
+# A fit starts from two linewidths: this one, in resolutions of the recording, and its geometric
+# mean with the maximum.  Linewidth, Hz, from which a line's amplitude must be constant.
 _WANDERS, WIDEST = 3.0, 2.0
 # Maximum width of a line relative to its frequency.
 SHARP = 0.05
@@ -133,7 +133,7 @@ class Resonance(Term):
     Autocovariance std^2 exp(-damping |tau|) (cos(w |tau|) + tilt damping/w sin(w |tau|)),
     w = 2 pi frequency; exact in law at any spacing.  tilt = 0 is the real part of a
     complex OU, 1 the voltage of the capacitor of an LC filter (passes low
-    frequencies), -1 that of its choke (nothing at 0 Hz).
+    frequencies), -1 the current of its choke (nothing at 0 Hz).
     """
 
     NAME: ClassVar[str] = 'resonance'

@@ -34,7 +34,7 @@ from ou_monitor.records import FloatArray, NAN
 _TWO_PI = 2.0 * math.pi
 # Limits within which nothing overflows: maximum signal and stamp, s; minimum step, s.
 LARGEST, LATEST, SHORTEST = 1e150, 1e18, 1e-12
-# Minimum gap in mean intervals, and minimum number of samples in the mean to count one.
+# Minimum gap, in mean intervals; number of samples before gaps are counted.
 _GAP, _KNOWN = 5.0, 10
 # Number of samples that are converted to Python floats at a time; limits memory.
 _PIECE = 16384

@@ -2,9 +2,9 @@
 Level and resistance of a supply from its measured current, by a Kalman filter.
 
 Limits: scale and sign of the current are not corrected, so a wrong scale makes the resistance
-wrong.  A load that follows throttle but bypasses the current sensor makes it too high (a sag of
-0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A); the stated error includes
-this only if throttle explains more of the residual than noise does.  A constant current gives no
+wrong.  A load that follows throttle but bypasses the current sensor makes it too high (on a robot
+that draws 1 A, 0.4 instead of 0.2 Ohm by a further sag of 0.1 V at full throttle); the error
+includes this only if throttle explains more of the residual than noise.  A constant current has no
 information.  (Throttle as a further regressor would absorb the other load, but on quads with slow
 current sensors it would also absorb at least half of the resistance.)
 """
@@ -20,8 +20,8 @@ from ou_monitor.online.load.blocks import (
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, POWER, reached
 from ou_monitor.records import FloatArray, NAN
 
-# Minimum current to start the filter, A; factor by which the largest current must rise for the
-# prior to be applied again, for the new largest current.
+# Minimum current to start the filter, A; rise of the largest current, as a factor, at which the
+# state is rescaled and the prior is applied again.
 _LEAST, _MORE = 1e-2, 4.0
 # Prior standard deviation of the voltage drop at the largest current, relative to the voltage;
 # shares of the drop that appear at once and after each of LAGS, and their standard deviations.
@@ -59,7 +59,7 @@ class CurrentFilter:
 
     def __init__(self) -> None:
         self._t = self._known_at = self._unit = NAN
-        # Largest current, so far and as received, and the last one, A; time with current, s.
+        # Largest current used and largest received; last current, A; time with current, s.
         self._largest = self._peak = self._before = self._seen = 0.0
         # Current at once and after each of LAGS, A.
         self._drawn: list[float] = []

@@ -56,7 +56,7 @@ _COUNTS = 2.0**32
 # Minimum rows before repeated stamps are put down to a coarse clock.
 _FEW_ROWS = 8
 # To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
-# deviation of that number; stamps per straight piece (a row, of ten per stamp, is 1 % of a piece).
+# deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 # Change by rounding; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0
@@ -571,8 +571,8 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
-            raise InputError(f"{path}: '{time.name}' says rows {time.scale:g} s apart, outside "
-                             f'{LEAST_STEP:g} to {LONGEST_STEP:g} s')
+            raise InputError(f"{path}: by '{time.name}' the rows are {time.scale:g} s apart, not "
+                             f'within {LEAST_STEP:g} to {LONGEST_STEP:g} s')
         values = numbers(path, form, places or [0], left_out=left_out)
         return time.scale * np.arange(float(values[0].size)), values
     if _holds_clocks(form, time.place[0]):
@@ -668,7 +668,7 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
             unit, t = 'd', t - first
         words = '' if unit == 's' else ', a guess: --time-unit'
     t = t * SCALES[unit]
-    # Minutes and longer are no mistake for a finer unit, nor is what the user states.
+    # A unit of minutes or more is no mistake for a finer one; a unit from the user is accepted.
     if usual * SCALES[unit] > LONGEST_STEP and SCALES[unit] <= 1.0 and not wanted.time_unit:
         raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? Give --time-unit")
@@ -718,7 +718,7 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
         if guess and column.name.lower() == 'rc.throttle' and known.size and known.max() > 100.0:
             unit = _DJI
         unit = unit or _throttle_unit(values[np.isfinite(values)], volts)
-        # Percent below 0 are of a stick; a duty below 0 is of a motor in reverse.
+        # Percentages below 0 are of a stick, except a duty, which is of a motor in reverse.
         if given is None and unit == '%' and np.mean(values < -MOST_THROTTLE) > WILD and not (
                 re.search('duty|pwm', column.name.lower())):
             guess, unit = True, '-100:100'
