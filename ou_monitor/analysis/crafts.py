@@ -28,6 +28,9 @@ _USUAL = 2.0
 # A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
 # without damage (a lead-acid cell has 2.1 V), and lowest at the beginning of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
+# Lowest voltage of a cell at which a supply is guessed to be a pack, V: pilots are warned below it
+# (vbat_warning_cell_voltage of Betaflight).  Rails of 3.3, 5, 6, 9 and 10 V are no packs then.
+_PACK = 3.5
 # Voltage at rest that a guess of the cells prefers, V: between full (4.2) and half full (3.8).
 _HALF = 4.0
 # Cells of usual LiFePO4 packs, and the range of the plateau of such a cell at rest, V.
@@ -130,7 +133,7 @@ def cell_count(full: float) -> int:
     if not (math.isfinite(full) and full > 0.0):
         return 0
     least = math.ceil(full / HIGHEST_CELL)
-    likely = [cells for cells in range(least, int(full / _BEGINS) + 1) if fits(full, cells)]
+    likely = range(least, int(full / _PACK) + 1)
     return min(likely, key=lambda cells: abs(full / cells - _HALF), default=0)
 
 
@@ -145,8 +148,9 @@ def check_cells(full: float, cells: int) -> None:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: '
             + (f'it is likely {counted(likely, "cell")} (lithium)' if (likely := cell_count(full))
-               else 'no number of lithium cells fits') + '; for lead-acid, or a rail that is no '
-            'battery, leave --cells out and give --brownout-voltage V')
+               else 'no number of charged lithium cells fits')
+            + '; for lead-acid, or a rail that is no battery, leave --cells out and give '
+            '--brownout-voltage V')
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:

@@ -203,5 +203,6 @@ def _raise_guesses(flights: Sequence[dict[str, Any]]) -> None:
     """Replace guessed cells by the vehicle's largest number that fits the flight's voltage."""
     known = sorted({one['cells'] for one in flights if one['cells']}, reverse=True)
     for one in flights:
-        if one['cells_from'] == 'guessed':
-            one['cells'] = next(cells for cells in known if fits(one['full_v'], cells))
+        found = next((cells for cells in known if fits(one['full_v'], cells)), 0)
+        if one['cells_from'] in ('guessed', 'unknown') and found:
+            one.update(cells=found, cells_from='guessed')

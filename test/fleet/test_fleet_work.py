@@ -10,10 +10,11 @@ from types import SimpleNamespace
 
 from made_logs import crazyflie, hover
 import numpy as np
+from ou_monitor.analysis.crafts import cell_count
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.fleet import SavedResults
+from ou_monitor.fleet.fleet import _raise_guesses, SavedResults
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern, start_of
 from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
@@ -311,3 +312,15 @@ def test_cells_that_a_recording_cannot_have_are_an_error(tmp_path):
     right, wrong = (work(str(path), Options(cells=cells)) for cells in (4, 9))
     assert (right['error'], right['cells'], right['cells_from']) == ('', 4, 'given')
     assert 'it is likely 4 cells' in wrong['error'] and not wrong['levels']
+
+
+@pytest.mark.parametrize('full, cells', [(13.6, 4), (13.2, 4), (5.1, 0)])
+def test_a_discharged_pack_has_the_cells_of_its_vehicle(full, cells):
+    """Alone, 13.6 V fits no charged pack, and 13.2 V three cells; 5.1 V is another supply."""
+    guess = cell_count(full)
+    flights = [{'cells': 4, 'cells_from': 'guessed', 'full_v': 16.6},
+               {'cells': guess or None, 'cells_from': 'guessed' if guess else 'unknown',
+                'full_v': full}]
+    _raise_guesses(flights)
+    assert guess != 4 and (flights[1]['cells'] or 0) == cells
+    assert flights[1]['cells_from'] == ('guessed' if cells else 'unknown')
