@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import as_numbers, as_seconds, FloatArray, Recording
 from ou_monitor.report.result import Result
+from ou_monitor.text import counted
 from ou_monitor.timeline import check_size, ordered, readings_of, supplied
 
 if TYPE_CHECKING:
@@ -348,7 +349,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         Brown-out level, V; on the bus, if `cells` is given, V per cell (by default 3.3).
     cells : int
         Cells in series; 0: as in the network or the recording, whose voltage is that of a rail if
-        it fits no pack.
+        it fits no pack.  A network with 0 cells is a rail.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -400,22 +401,31 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
                              '99 % quantile of throttle is used')
         circuit = PowerNetwork(**completed(values))
         level, source = (voltage, 'given') if voltage is not None else default_voltage(
-            circuit.cells if rail == 'bus' else 0, circuit.regulator_voltage)
+            *((circuit.cells, circuit.battery_voltage) if rail == 'bus' else
+              (0, circuit.regulator_voltage)))
     else:
         flown = supplied(readings_of(_read(recording)))
         full, stated = full_voltage(flown), stated_limit(flown.source)
-        cells = values.setdefault('cells', cells_of(flown)[0])
+        cells, origin = (values['cells'], 'given') if 'cells' in values else cells_of(flown)
+        values['cells'] = cells
         if cells:
             check_cells(full, cells)
         else:
-            # The source is a rail: it feeds no other one, and all its load is in the recording.
-            rail, values = 'bus', {'regulator_voltage': 0.5 * full, 'mcu_current': 0.0, **values}
+            # The recorded voltage is that of the rail itself.
+            rail = 'bus'
+        if rail == 'bus':
+            # What a regulator draws is in the recorded voltage.
+            values.setdefault('regulator_voltage', 0.0)
         if voltage is not None:
             level, source = voltage, 'given'
         elif stated is not None and stated[0] == cells:
             level, source = stated[1], 'from the log'
         else:
             level, source = default_voltage(cells, full)
+            if origin == 'guessed':
+                source += (f', {counted(cells, "cell")} guessed from the voltage: --cells N for '
+                           'others, --set cells=0 with --brownout-voltage V for a rail or '
+                           'lead-acid')
         flight, facts, risk_of = _flight(
             flown, full, cells, level if rail == 'bus' else None, horizon, risk)
         if not facts.sag.known and 'battery_resistance' not in values:
@@ -427,7 +437,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if rail != 'bus' and voltage is None:
             level, source = default_voltage(0, circuit.regulator_voltage)
         assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
-        taken = taken_words(flight, circuit, throttle, assumed)
+        taken = taken_words(flight, circuit, throttle, assumed, origin)
         error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
             throttle, flight.throttle, flight.sag))
         if facts.budget is not None and not values.keys() & SHOWN and math.isfinite(

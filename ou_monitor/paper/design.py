@@ -33,16 +33,17 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
+from ou_monitor.online.settings import DEFAULT_LIMIT, RAIL
 from ou_monitor.paper.network import completed, PowerNetwork, Rail, rail_at
 from ou_monitor.text import number, percent
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
 CELL_BROWNOUT = 3.3  # Brown-out level of a LiPo cell, V
-# Regulated voltage, V -> (brown-out level, V, source).
-REGULATED_BROWNOUT = {
-    5.0: (4.5, 'lower limit of the 5 V rail in PX4'),
-    3.3: (2.88, 'STM32F405 brown-out reset level 3, falling, highest (ST DS8626)')}
+# Range of a rail, V -> (brown-out level, V, source); 3.3 V +- 0.3 V by JEDEC JESD8C.
+RAIL_BROWNOUT = {
+    RAIL: (DEFAULT_LIMIT, 'lower limit of the 5 V rail in PX4'),
+    (3.0, 3.6): (2.88, 'STM32F405 brown-out reset level 3, falling, highest (ST DS8626)')}
 LEAST, MOST = 10e-6, 22e-3  # Range of capacitances, F
 # Capacitances tried before the root is refined, because the risk may not be monotonic.
 _GRID = 81
@@ -150,15 +151,15 @@ class Design:
     assumed: bool = False  # Whether the battery resistance is assumed: shares of it are shown.
 
 
-def default_voltage(cells: int, regulated: float) -> tuple[float, str]:
+def default_voltage(cells: int, rail: float) -> tuple[float, str]:
     """Return the brown-out level of a pack, or without cells of a rail, V, and its source."""
     if cells:
         return CELL_BROWNOUT * cells, f'{CELL_BROWNOUT} V per LiPo cell'
-    for voltage, level in REGULATED_BROWNOUT.items():
-        if math.isclose(regulated, voltage, rel_tol=0.01):
+    for (low, high), level in RAIL_BROWNOUT.items():
+        if low <= rail <= high:
             return level
-    raise ValueError('there is no default brown-out voltage for a regulated rail of '
-                     f'{regulated:.4g} V: give one (--voltage)')
+    raise ValueError(f'there is no default brown-out voltage for a rail of {rail:.4g} V: give '
+                     'one (--brownout-voltage)')
 
 
 def with_capacitance(network: PowerNetwork, capacitance: float,
@@ -511,6 +512,9 @@ def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerN
     rate = network.flutter_rate
     if flight.var_inf > slow:
         slow, rate = min(flight.var_inf, rms ** 2), flight.alpha
+    if throttle == 1.0:
+        # No ESC switches at full throttle.
+        slow = rms ** 2
     quiet = replace(network, switching_scale=0.0, flutter=0.0, flutter_rate=rate)
     base = rail_at(quiet, throttle).var_inf
     scales: dict[str, Any] = {}

@@ -96,8 +96,8 @@ class PowerNetwork:
     # mean, and its rate, 1/s (motor and propeller, 30 ms); off by default.
     flutter: float = _part(0.0, zero=True)
     flutter_rate: float = _part(33.3, '1/s')
-    # Output voltage, V, and output resistance within the bandwidth, Ohm.
-    regulator_voltage: float = _part(5.0, 'V')
+    # Output voltage, V (0: no regulator), and output resistance within the bandwidth, Ohm.
+    regulator_voltage: float = _part(5.0, 'V', zero=True)
     regulator_resistance: float = _part(0.03, 'Ohm')
     # The regulator rejects changes of its input slower than this, Hz, and multiplies faster ones
     # by `line_gain`; None: by the open-loop gain of a buck converter, its duty regulator_voltage /
@@ -200,8 +200,8 @@ def load_at(network: PowerNetwork, throttle: float) -> Load:
         raise ValueError(
             f'the battery cannot supply the load at throttle {throttle:g}: {current:.4g} A '
             f'through battery_resistance {resistance:g} Ohm drops {resistance * current:.4g} V of '
-            f'{network.battery_voltage:g} V, which leaves the regulator less than '
-            f'{network.regulator_voltage:g} V')
+            f'{network.battery_voltage:g} V, and at least {network.regulator_voltage:g} V must '
+            'remain')
     return Load(
         current=current, switching_rms=rms,
         switching_rate=network.esc_frequency / (duty * (1.0 - duty)),
@@ -290,6 +290,8 @@ def rail_at(network: PowerNetwork, throttle: float, rail: str = 'bus') -> Rail:
     """Return a rail of a network at a throttle."""
     if rail not in RAILS:
         raise ValueError(f"rail must be 'bus' or 'regulated', got {rail!r}")
+    if rail == 'regulated' and not network.regulator_voltage:
+        raise ValueError('there is no regulated rail: regulator_voltage is 0')
     load = load_at(network, throttle)
     a, outputs = _circuit(network, load.input_conductance)
     b = np.zeros((a.shape[0], len(SOURCES)))

@@ -10,7 +10,7 @@ from ou_monitor.paper.design import (
 from ou_monitor.paper.network import PowerNetwork
 from ou_monitor.report.document import Document, Figure, Table, Text
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number, percent
+from ou_monitor.text import counted, number, percent
 
 # Rows of the calculation for each row of the printed table.
 _EVERY = 10
@@ -33,8 +33,9 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
              for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
     name = ('regulated rail' if result.rail != 'bus' else
             'battery bus' if result.network.cells else 'recorded rail')
-    subject = (f'{name} at {percent(result.throttle)} throttle: mean {present.mean:.4g} V (sag of '
-               f'the bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), '
+    sag = 'sag' if result.rail == 'bus' else 'sag of the bus'
+    subject = (f'{name} at {percent(result.throttle)} throttle: mean {present.mean:.4g} V ({sag} '
+               f'{present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), '
                f'allowed risk {result.target:g} within {result.horizon:g} s')
     answers = [answer(result)]
     if taken and result.least is not None:
@@ -71,13 +72,18 @@ def _time(value: float) -> str:
     return 'never' if value > 1e100 else f'{number(value)} s'
 
 
-def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed: bool) -> str:
-    """Return the values taken from a flight, and the missing ones."""
+def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed: bool,
+                origin: str) -> str:
+    """Return the values taken from a flight, and the missing ones (origin: of the cells)."""
+    cells = f'{counted(network.cells, "cell")} ({origin})' if network.cells else (
+        'taken as a rail, whose regulator is a constant voltage behind a resistance')
+    regulator = '' if network.regulator_voltage else (
+        ' Regulators that it feeds are left out: their current is in the recorded voltage.')
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
-    return (f'From the flight: {flight.level:.4g} V open-circuit at its end (by the load '
-            f'model; the risks include its error), {network.cells or "no"} '
-            f'cells (highest median of 0.5 s {flight.full:.4g} V; --cells N for others), sag '
+    return (f'From the recording: {flight.level:.4g} V without load at its end (by the load '
+            f'model; the risks include its error), {cells} (highest median of 0.5 s '
+            f'{flight.full:.4g} V; --cells N for a pack of N cells), sag '
             f'{sag:.3g} V (+- {2.0 * se:.2g} V, included in the risks, which are computed as in '
             'analyze, with the sag and noise of each row) and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
@@ -87,4 +93,5 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
                f'{1e3 * network.battery_resistance:.3g} mOhm.')
             + ('' if math.isfinite(flight.alpha) else ' It shows no relaxation: alpha of slow '
                f'noise is assumed to be {number(network.flutter_rate)} 1/s.')
-            + ' A flight shows neither bulk capacitor nor ESR: --set bulk_capacitance=470uF.')
+            + regulator
+            + ' A recording shows neither bulk capacitor nor ESR: --set bulk_capacitance=470uF.')

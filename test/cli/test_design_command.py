@@ -209,7 +209,55 @@ def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
     assert math.sqrt(found['present']['var_inf']) == pytest.approx(0.009, rel=0.2)
     assert found['network']['cells'] == 0 and 'packs' not in str(found)
     assert main(['design', '--from', str(path), '--cells', '1']) == 2
-    assert 'no number of lithium cells fits; for lead-acid, or a rail' in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert 'no number of charged lithium cells fits; for lead-acid, or a rail' in err
+
+
+@pytest.mark.parametrize('volts, level, said', [
+    (5.08, 4.5, '5 V rail in PX4'), (3.31, 2.88, 'STM32F405'), (6.0, 4.5, '5 V rail in PX4'),
+    (12.0, 9.9, '3 cells guessed from the voltage: --cells N for others, --set cells=0 with')])
+def test_a_recorded_rail_is_the_source(volts, level, said, tmp_path, capsys):
+    """A regulator of 0.1 Ohm, up to 2 A: mean = level - R I, and one pole, 1 / ((R + ESR) C)."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(0.0, 1.0, 80), 50)
+    path = tmp_path / 'rail.csv'
+    path.write_text('time_s,voltage_v,throttle,current_a\n' + ''.join(
+        f'{k / 50.0:.2f},{volts - 0.2 * one + 0.003 * noise:.5f},{one:.3f},{2.0 * one:.4f}\n'
+        for k, (one, noise) in enumerate(zip(u, rng.standard_normal(u.size)))))
+    found = asked(capsys, '--from', path)
+    assert found['brownout_voltage'] == pytest.approx(level)
+    assert said in found['brownout_voltage_source']
+    if volts == 12.0:
+        # It may as well be a pack, so only the user knows.
+        assert 'guessed' not in asked(capsys, '--from', path, '--cells', '3')[
+            'brownout_voltage_source']
+        assert main(['design', '--from', str(path), '--set', 'cells=0']) == 2
+        assert 'for a rail of 12 V' in capsys.readouterr().err
+        found = asked(capsys, '--from', path, '--set', 'cells=0', '--voltage', '11.5')
+    network, present = found['network'], found['present']
+    assert (network['cells'], network['regulator_voltage']) == (0, 0.0)
+    ohm = network['battery_resistance']
+    assert ohm == pytest.approx(0.1, rel=0.1)
+    assert present['sag'] == pytest.approx(0.2 * found['throttle'], rel=0.05)
+    assert present['mean'] == pytest.approx(network['battery_voltage'] - present['sag'])
+    assert present['mean'] == pytest.approx(volts - 0.2 * found['throttle'], abs=0.01)
+    assert present['alpha'] == pytest.approx(1.0 / ((ohm + 0.03) * 470e-6), rel=1e-6)
+    assert 'taken as a rail' in found['measured'] and 'packs' not in str(found)
+
+
+def test_the_sag_of_a_small_pack_is_the_recorded_one(tmp_path, capsys):
+    """The current of its regulator is in the recording, and full throttle has noise too."""
+    rng = np.random.default_rng(4)
+    u = np.tile(np.repeat([0.2, 0.6, 1.0, 0.4, 0.8], 100), 8)
+    path = tmp_path / 'micro.csv'
+    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
+        f'{k / 100.0:.2f},{4.0 - 0.4 * one + 0.006 * noise:.5f},{one:.3f}\n'
+        for k, (one, noise) in enumerate(zip(u, rng.standard_normal(u.size)))))
+    found = asked(capsys, '--from', path)
+    sag = dict(zip(found['supply']['sag']['throttle'], found['supply']['sag']['sag_v']))
+    assert found['throttle'] == 1.0
+    assert found['present']['sag'] == pytest.approx(sag[1.0], rel=1e-9)
+    assert math.sqrt(found['present']['var_inf']) == pytest.approx(0.006, rel=0.2)
 
 
 def test_cells_set_the_voltage(capsys):

@@ -85,6 +85,16 @@ def test_the_regulated_rail_in_its_own_noise():
     assert rail.mean == pytest.approx(5.0 - 0.03 * 0.5)
 
 
+def test_without_a_regulator_the_source_feeds_the_load_alone():
+    network = PowerNetwork(cells=0, battery_voltage=5.0, current_max=10.0, regulator_voltage=0.0)
+    rail = rail_at(network, 0.4)
+    assert rail.load.sag == pytest.approx(0.04 * network.current_at(0.4), rel=1e-12)
+    assert rail.alpha == pytest.approx(1.0 / ((0.04 + 0.03) * 470e-6), rel=1e-10)
+    assert impedance(rail, 0.0).real == pytest.approx(0.04, rel=1e-12)
+    with pytest.raises(ValueError, match='no regulated rail'):
+        rail_at(network, 0.4, 'regulated')
+
+
 @pytest.mark.parametrize('network', [PowerNetwork(), PowerNetwork(line_gain=0.01)])
 def test_the_regulator_passes_what_is_faster_than_its_bandwidth(network):
     """Bus to output: gain s/(s + w) times (1 + s r C)/(1 + s (Ro + r) C)."""
