@@ -384,9 +384,9 @@ def ordered(recording: Recording) -> Recording:
 OFF, _ON = 0.2, 0.7
 # Maximum reading, as a multiple of the usual voltage (6S after 5 V of USB: 5).
 WILD_FACTOR = 20.0
-# Maximum number of outages, or if larger, their maximum share of the samples (also of wild
-# readings); maximum share of samples off; maximum ratio of samples between the two limits to
-# samples below the lower one.
+# Maximum number of outages, or this share of the samples if it is more; the share is also the
+# maximum of wild readings.  Maximum share of samples off; maximum ratio of samples between the two
+# limits to samples below the lower one.
 _OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0
 # Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6

@@ -87,7 +87,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     if aligned is not None:
         notes.append(f'The level of the model was moved by {number(float(shifts.mean()), 3)} V '
                      f'(+- {number(float(shifts.std()), 2)} V), so that the mean of the first '
-                     f'{_ALIGNED:g} s of each simulation equals the recording.')
+                     f"{_ALIGNED:g} s of each simulation equals the recording's.")
     if strays:
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')

@@ -47,7 +47,7 @@ _REACH = 3.0
 # and maximum share of the recording.  Minimum number of samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
 # The slow error of the load model is an OU: its time constant, s, and the standard deviations
-# tried, V per cell (doc/load.md explains the maximum).
+# tried, V per cell (the maximum was chosen on the recordings).
 SLOW_TIME = 20.0
 _SLOW_STDS = np.geomspace(0.001, 0.00464, 5)
 # Initial standard deviations of white and slow noise, V per cell, typical of the recordings.

@@ -89,7 +89,7 @@ _REFINED, _RIVAL = 10.0, 6.0
 # maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.
 _IMPRECISE = 0.37
 # Usual walk of the level, V per sqrt(s) and cell; above it, prior standard deviation of its
-# logarithm.  Walks of .0015 to .015 fit the recordings (doc/load.md).
+# logarithm.  Walks of .0015 to .015 fit the recordings.
 _WALK, _WALK_SD = 0.004, 0.8
 # Maximum alpha dt: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0

@@ -31,7 +31,7 @@ from sensor_msgs.msg import BatteryState, JointState
 
 ADC_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('device', '', 'IIO or hwmon device: its name, its folder name, or a path.'),
-    Parameter('channel', '', 'Channel, as in_voltage0 or in1; empty: the only one.'),
+    Parameter('channel', '', 'Channel, such as in_voltage0 or in1; empty: the only one.'),
     Parameter('gain', 1.0, 'Supply volts per volt at the ADC (the divider).',
               1.0e-6, 1.0e6),
     Parameter('offset', 0.0, 'Added after the gain, V.', -1000.0, 1000.0),

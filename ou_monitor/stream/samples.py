@@ -91,8 +91,8 @@ class _Track:
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # After a silence, messages were lost, or none was sent: the second needs a fit better by
-        # half a message.
+        # After a silence, messages were lost, or none was sent; assume the second only if it fits
+        # better by half a message.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:

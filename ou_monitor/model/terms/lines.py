@@ -57,8 +57,9 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
 # Segments per 1 / linewidth, and minimum number of segments.
 _FINE, _ENOUGH = 4.0, 12
 # Maximum `power_spread` of a line of constant amplitude, and minimum of ringing; from 0.7 to 0.85,
-# evidence decides.  In simulations with outliers and 14 segments, 60 of 60 lines and 10 of 60
-# ringings were below CONSTANT, 2 and 54 above RINGING (33 segments: 60 and 2, 0 and 60).
+# evidence decides.  In simulations with outliers and 14 segments, all 60 lines, but also 10 of 60
+# ringings were below CONSTANT, and 54 ringings, but also 2 lines above RINGING (with 33 segments:
+# 60 lines and 2 ringings, 60 ringings and no line).
 CONSTANT, RINGING = 0.85, 0.7
 
 

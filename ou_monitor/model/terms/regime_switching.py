@@ -113,7 +113,7 @@ class Scores:
         exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
         for off, high, keep, draw, slow in columns:
-            # With at_once the filter follows the level, otherwise the rail, which follows it.
+            # With at_once the filter follows the level, otherwise the rail behind the level.
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind

@@ -69,7 +69,7 @@ _LOOKS = 4
 SLIDING = OU_WINDOWS[0]
 # Time between two fits, as a share of the window, and its minimum, s.
 _SHARE, _SOONEST = 0.25, 1.0
-# Share of one core that fits in the background may take.
+# Maximum share of one core for fits in the background.
 _CPU = 0.05
 # Statuses of an estimate without a relaxation whose window is too short for a fit.
 _SHORT = (Status.TOO_FEW_SAMPLES, Status.TOO_SHORT)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ou_monitor.model.load import LAGS, LINEAR_LAGS
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-# Exponent of throttle in the load, and, less 1, of the level: the prior of `load_fit`.
+# Exponent p of throttle in the load (of the level: p - 1), from the prior of `load_fit`.
 POWER = 1.8
 # Time at constant throttle for which the sag is stated, s: motors and converters have settled, and
 # longer bursts of throttle are rare.  If the load has been known for less than _HOLDS such times,

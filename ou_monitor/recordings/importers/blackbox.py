@@ -77,7 +77,7 @@ def read(path: Path, request: Request) -> Log:
     rest = parser.reader._frame_data[end:].removeprefix(b'End of log\0')
     broken = int(parser._ctx.invalid_frame_count)
     if dropped:
-        notes.append(f'At least {counted(dropped, "frame")} dropped: no sound key frame before '
+        notes.append(f'At least {counted(dropped, "frame")} dropped: no intact key frame before '
                      'them.')
     if broken:
         notes.append(f'{counted(broken, "piece")} unknown to orangebox left out: broken bytes, or '

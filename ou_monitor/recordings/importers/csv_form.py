@@ -51,7 +51,7 @@ _DAMAGE = re.compile(rb'[^\t\n\r\f -\xff]')
 # Consecutive rows of numbers that mark the beginning of the data.
 _IN_A_ROW = 8
 
-# What a line of comment begins with.
+# First characters of a comment line.
 COMMENTS = ('#', '%')
 DELIMITERS = {'tab': '\t', 'space': ' '}
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')

@@ -118,7 +118,7 @@ def test_frames_before_the_first_key_frame_are_dropped(tmp_path):
     pieces = blackbox(quad(128))
     path, log = load(tmp_path, [pieces[0], *pieces[5:]])
     assert choose(path, log).voltage.n == 96
-    assert 'dropped: no sound key frame before them' in log.notes[0]
+    assert 'dropped: no intact key frame before them' in log.notes[0]
 
 
 def test_readings_of_the_adc(tmp_path):
