@@ -10,6 +10,7 @@ import sys
 import time
 
 from ou_monitor.cli.commands import COMMANDS
+from ou_monitor.cli.main import main
 from project import ROOT
 import pytest
 
@@ -247,7 +248,7 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
     assert 15.0 < float(rows[-1][2]) < 17.5
 
 
-def test_the_man_page_has_the_texts_of_help():
+def test_the_man_page_has_the_texts_of_help(capsys):
     name = 'make_man'
     spec = importlib.util.spec_from_file_location(name, ROOT / 'scripts' / f'{name}.py')
     maker = importlib.util.module_from_spec(spec)
@@ -256,7 +257,7 @@ def test_the_man_page_has_the_texts_of_help():
     assert written == maker.page()
     words = written.replace('\\-', '-')
     for command in COMMANDS:
-        shown = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', command, '--help'],
-                               cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        assert main([command, '--help']) == 0
+        shown = capsys.readouterr().out
         assert f'.SS {command}\n' in words
         assert all(option in words for option in re.findall(r'--[a-z-]+', shown))

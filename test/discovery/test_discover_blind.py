@@ -117,7 +117,8 @@ def test_nothing_is_found_where_nothing_is_hidden():
 def test_two_at_once_are_both_named():
     """Required: 80 %; at least two of five pairs."""
     # Fewer have a chance of 0.7 % at that level, and of 53 % at 30 %.
-    enough([('pair', '+'.join(pair), 0) for pair in chosen(list(pairs()), 5, 1)], 0.80,
+    strong = [pair for pair in pairs() if not set(pair) & set(WHOLE)]
+    enough([('pair', '+'.join(pair), 0) for pair in chosen(strong, 5, 1)], 0.80,
            lambda one: one.all_named)
 
 
@@ -135,7 +136,7 @@ def searched() -> list[str]:
             and kinds[cause].ROLE is not Role.EXACT and cause != 'clock_jitter']
 
 
-@pytest.mark.parametrize('cause', chosen(searched(), 3, 3),
+@pytest.mark.parametrize('cause', chosen(searched(), 1, 3),
                          ids=lambda cause: f'{cause}, {SEED}')
 def test_a_cause_removed_from_the_catalogue_is_not_named(cause, monkeypatch):
     """A cause is named by its entry: found with it; without it neither found nor a rival."""

@@ -65,7 +65,7 @@ def test_bad_samples_are_named_although_they_are_most_of_the_variance(share, siz
 
 def test_a_lagged_sag_under_jittering_throttle_is_found():
     """Throttle trembles: a sag at once explains nothing, and neither does a lag without it."""
-    rng, n, rate = np.random.default_rng(2), 60000, 2000.0
+    rng, n, rate = np.random.default_rng(2), 30000, 1000.0
     throttle = 0.5 + rail(rng, n, 2.0, rate, 0.2)
     voltage = 12.0 + rail(rng, n, 30.0, rate, 0.015, -0.1 * throttle)
     finding = discover(Recording(np.arange(n) / rate, voltage, throttle))

@@ -127,9 +127,10 @@ def test_the_loss_by_parameters_is_that_of_theory():
     assert np.mean(losses) + wanted > 4.0 * np.std(losses, ddof=1) / math.sqrt(40)
 
 
-@pytest.mark.parametrize('name', sorted(set(KINDS) - {'parabola', 'curved drift'}))
+@pytest.mark.parametrize('name', ['load_sag', 'load_dependent_sigma', 'second_relaxation'])
 def test_the_gain_reported_is_the_true_models(name):
     """Within three errors of the true model's, over the plain fit that `discover` made."""
+    # One of the mean, one of the intensity, one with a state; the gains of all kinds are above.
     true, _ = KINDS[name]
     simulated_of = simulated(2000, true)
     found = discover(Recording(simulated_of.t, simulated_of.voltage, simulated_of.throttle, name))

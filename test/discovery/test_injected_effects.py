@@ -6,7 +6,7 @@ from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import discover, read_recording, Recording
 from ou_monitor.criticism.integrity import examine
-from project import REAL, recorded, ROOT
+from project import ROOT
 import pytest
 
 # Seconds of the flight: throttle moves all the time; 200 Hz, codes of 10 mV.
@@ -63,27 +63,17 @@ def test_codes_moved_by_what_is_no_code_are_no_holds(height):
     assert examine(Recording(t, moved, throttle)).exact == ()
 
 
-# Recorded runs, and the seconds of each in which effects are hidden: short, so that it is cheap.
-FLIGHTS = {'gecko': (ROOT / 'bags' / 'recorded' / 'gecko.csv', 30.0, 40.0),
-           'cf_solo': (REAL / 'cf_solo_large.csv', 10.0, 22.0)}
-
-
 @cache
-def piece(name):
-    """Return a piece of a recorded run, and the causes that it has by itself."""
-    path, first, last = FLIGHTS[name]
-    whole = recorded(path)
-    part = (whole.t >= first) & (whole.t < last)
-    found = Recording(whole.t[part], whole.voltage[part], whole.throttle[part])
+def piece():
+    """Return ten seconds of the flight, and the causes that they have by themselves."""
+    found = Recording(*(values[:2000] for values in flown()))
     return found, [cause.name for cause in discover(found).causes]
 
 
-@pytest.mark.parametrize('name, effect', [('gecko', 'jumps'), ('cf_solo', 'tone')])
-def test_an_effect_hidden_in_a_flight_is_named_beside_its_sag(name, effect):
+@pytest.mark.parametrize('effect', ['jumps', 'tone'])
+def test_an_effect_hidden_in_a_flight_is_named_beside_its_sag(effect):
     """At strength 2, the middle of the table in doc/discovery.md; the flight alone has none."""
-    if not FLIGHTS[name][0].exists():
-        pytest.skip('recorded runs are elsewhere')
-    flight, own = piece(name)
+    flight, own = piece()
     inject, right = EFFECTS[effect]
     hidden = inject(flight, 2.0 * noise_of(flight.voltage), np.random.default_rng(7))
     found = [cause.name for cause in discover(hidden).causes]

