@@ -225,6 +225,36 @@ class LoadDelay:
         return True
 
 
+# The response has changed if the voltage at rest and the load correlate by more than this in two
+# successive segments of `_PIECE`, of at least this number of blocks.  With 0.8, none changed on
+# 22 recordings (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and others); a sag of 20 times the noise is noticed within 4 s.
+_CHANGED, _BLOCKS = 0.8, 20
+
+
+class LoadChange:
+    """Notices that the response to load has changed, for example when the motors are armed."""
+
+    def __init__(self) -> None:
+        # Sums of 1, voltage at rest, load, and their products in the present segment; its start.
+        self._sums = np.zeros(6)
+        self._begun = math.nan
+        self._last = 0.0  # Correlation in the last segment.
+
+    def take(self, t: float, rest: float, x: float) -> bool:
+        """Take a block, s, its voltage at rest, V, and its load; return whether it has changed."""
+        if not t - self._begun < _BLOCKS * _PIECE:
+            self._begun, self._last, self._sums = t, 0.0, np.zeros(6)
+        changed = False
+        if t - self._begun >= _PIECE and self._sums[0] >= _BLOCKS:
+            _, v_mean, x_mean, vv, xx, xv = (self._sums / self._sums[0]).tolist()
+            vv, xx, xv = vv - v_mean * v_mean, xx - x_mean * x_mean, xv - v_mean * x_mean
+            r = xv / math.sqrt(vv * xx) if vv > 0.0 and xx > _MOVED ** 2 else 0.0
+            changed = abs(r + self._last) > 2.0 * _CHANGED
+            self._begun, self._last, self._sums = t, 0.0 if changed else r, np.zeros(6)
+        self._sums += (1.0, rest, x, rest * rest, x * x, x * rest)
+        return changed
+
+
 # Limit of standard scores, above which errors weigh less, and limit of their squares in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
 # Variance of a prediction, V^2, above which the filter has diverged, as after readings of

@@ -18,7 +18,7 @@ from ou_monitor.model.load import (
     CELL, cells_in_series, INRUSH_TIME, LAGS, LEVELS, LINEAR_LAGS, LoadStart, ripple, SLOPES,
     usual_coefficients)
 from ou_monitor.online.load.blocks import (
-    CLIP, DIVERGED, LoadBlock, LoadBlocks, LoadDelay, LoadNoise, log_density)
+    CLIP, DIVERGED, LoadBlock, LoadBlocks, LoadChange, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.current_filter import CurrentFilter, UNKNOWN_HELD
 from ou_monitor.online.load.model_watch import (
     compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack, SIZE_ERROR)
@@ -63,7 +63,8 @@ _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
 _MEAN, _COV, _SIZE = usual_coefficients()
 _STATES = 2 + _MEAN.size
-_DRIFT = _CHANGE * np.eye(_MEAN.size) * _SIZE ** 2
+# Variance of the changes per second, relative to the square of the steady sag.
+_DRIFT = _CHANGE * np.eye(_MEAN.size) * (_SIZE / _MEAN[:-1].sum()) ** 2
 
 
 class FastLevel:
@@ -290,6 +291,7 @@ class LoadFilter:
     def _settle(self, v: float, u: float) -> None:
         """Set the level from one voltage, V, and the coefficients."""
         self._opening, self._bias, self._throttle = False, 0.0, u
+        self._change = LoadChange()
         self._fast = FastLevel()
         held = u if math.isfinite(u) else 0.0
         self._lagged = self._settled = held
@@ -359,7 +361,10 @@ class LoadFilter:
         P[0, 0] += (_WALK * self._cells) ** 2 * dt + (
             0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
         a = m[2:]
-        P[2:, 2:] += dt * (_WARMING * a[:, None] * a + self._volts ** 2 * _DRIFT)
+        # Steady sag at full throttle, V: its mean square, so that a small sag can still grow.
+        sag = float(a[:-1].sum())
+        square = sag * sag + max(0.0, float(P[2:-1, 2:-1].sum()))
+        P[2:, 2:] += dt * (_WARMING * a[:, None] * a + square * _DRIFT)
 
     def _correct(self, block: LoadBlock, du: float) -> None:
         """Take a block, V, whose throttle differs from the last one by du."""
@@ -399,8 +404,12 @@ class LoadFilter:
         if abs(self._bias) > 3.0:
             P[0, 0] += (0.05 * self._volts) ** 2
             self._bias = 0.0
-        self._fast.take(block.t, block.voltage - float(h[2:] @ m[2:]), total, float(m[0]),
-                        _FAST_WALK * self._cells)
+        rest = block.voltage - float(h[2:] @ m[2:])
+        if self._change.take(block.t, rest, float(h[2])):
+            P[2:, 2:] += _COV * self._volts ** 2
+            self._noise = LoadNoise(self._volts)
+            self._delay.forget()
+        self._fast.take(block.t, rest, total, float(m[0]), _FAST_WALK * self._cells)
         m += g * (e / total)
         P -= g[:, None] * (g / total)
         self._rest = block.voltage - float(h[2:] @ m[2:])
