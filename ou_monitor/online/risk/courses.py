@@ -12,10 +12,11 @@ Pilot's future throttle: each completed horizon provides one course.  One rise f
 throttle into each fifth of the range above it is added (rule of succession).  Limits: within a
 horizon, the peak is assumed to come first.
 
-Excursions do not need the load: the risk follows from the margin of the present voltage.  To the
-drops of the flight, one of twice the standard deviation of the last 5 s is added.  Horizons below
-1 s and above 5 s use the nearest coefficients.  Limits: throttle is not used; the tail beyond 8
-deviations is assumed to fall as the tail of Student's t in the other laws does.
+Excursions do not need the load: the risk follows from the margin of the present voltage, and from
+the drops of this flight.  One further drop, twice the standard deviation of the last 5 s, stands
+for what has not been flown yet.  Horizons below 1 s and above 5 s use the nearest coefficients.
+Limits: throttle is not used; beyond 8 deviations, the risk is assumed to fall as the tail of
+Student's t in the other laws does.
 
 Limits of the blocks: with a source slower than a block, empty blocks repeat its last value, up to
 a maximum silence; a horizon with a longer silence counts as incomplete.

@@ -6,8 +6,8 @@ risk; with an unknown risk the level is UNKNOWN, never OK, and the flag is never
 
 The voltage floor is a threshold on the samples, without a model.  It is compared with the median
 of the last `brownout.floor_time` seconds, so that a single wrong sample has no effect.  Every
-sample is checked, also between two reports.  If its stamp is late, frozen, irregular or missing,
-its order of arrival counts; such samples that arrive together are spaced by their usual interval.
+sample is checked, also between two reports.  A sample whose stamp is late, frozen, irregular or
+missing keeps its place by arrival; several that arrive together are spaced by the usual interval.
 The next update reports a dip, even if nothing has arrived since.  Limit: a wrong value that a
 logger repeats for more than half of `brownout.floor_time` counts as a dip.
 """

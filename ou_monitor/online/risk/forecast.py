@@ -13,9 +13,10 @@ distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - st
 Each law is mixed with a wider one, whose weight is the share of horizons that contradict the law
 (rule of succession).  A horizon counts with the probability that the law was wrong in it, and with
 step / horizon where horizons overlap.  For first passage the other method takes the place of the
-wider law.  For a given throttle it is as wide as the excursions, but at most `_WIDEST` times as
-wide as the law, because excursions include bursts of throttle, which are irrelevant to idling.  It
-is wider if contradicting voltages were farther below the mean of the law.
+wider law.  For a given throttle the wider law has the width of the excursions, but at most
+`_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
+irrelevant to idling.  It is wider still if the contradicting voltages were farther below the mean
+of the law.
 
 Limits, in addition to doc/risk.md: all throttles share one bias and one gain; values between two
 horizons are interpolated.
@@ -198,8 +199,8 @@ LOOK, _LOOK_SHARE = 0.2, 0.2
 _REST = 0.05
 # Limit of the error of ln sigma; with a larger one, sigma is practically unknown.
 _LARGEST_ERROR = 1.0
-# Prior for first passage, which is used only if the tests of the window have found an OU: the
-# number of horizons that it has predicted, for one that it has not.
+# Number of horizons that initially count as agreeing with first passage; one counts as
+# contradicting it.  It is large, because first passage is used only if the window is an OU.
 _PREDICTED = 9.0
 # Share of the excursions in the method `load`, because the pilot's next throttle is unknown.
 # Half: the errors of the two forecasts differ, and no flight is long enough to learn weights (on
