@@ -459,10 +459,13 @@ class FieldReader:
         stamped = ~np.isnan(stamp)
         if not stamped.all():
             stamp[~stamped] = seconds(table.log_time[~stamped])
-        begin = np.cumsum(count) - count
-        values = np.empty(int(count.sum()))
-        for picked, block in blocks:
-            values[begin[picked][:, None] + np.arange(block.shape[1])] = block
+        if len(blocks) == 1 and blocks[0][0].size == n:
+            values = blocks[0][1].reshape(-1)
+        else:
+            begin = np.cumsum(count) - count
+            values = np.empty(int(count.sum()))
+            for picked, block in blocks:
+                values[begin[picked][:, None] + np.arange(block.shape[1])] = block
         column = FieldColumn(table.log_time, stamp, stamped, count, values, beside)
         if refused:
             column = column.take(np.flatnonzero(kept))
@@ -522,8 +525,10 @@ class FieldReader:
             # An element beyond its array: nothing in a block, else an unknown value.
             return np.full((rows.shape[0], int(spec.sample_rate is None)), np.nan)
         block = place.column(rows).reshape(rows.shape[0], -1)
-        block *= spec.sign * spec.unit_factor
-        block += spec.offset
+        if spec.sign * spec.unit_factor != 1.0:
+            block *= spec.sign * spec.unit_factor
+        if spec.offset:
+            block += spec.offset
         finite = np.isfinite(block)
         if not finite.all():
             block[~finite] = np.nan
