@@ -226,8 +226,9 @@ class LoadDelay:
 
 
 # The response has changed if the voltage at rest and the load correlate by more than this in two
-# successive segments of `_PIECE`, of at least this number of blocks.  With 0.8, none changed on
-# 22 recordings (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and others); a sag of 20 times the noise is noticed within 4 s.
+# successive segments of `_PIECE`, of at least this number of blocks.  With 0.8, none of 22
+# recordings changed (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and others),
+# and a sag of 20 times the noise is noticed within 4 s.
 _CHANGED, _BLOCKS = 0.8, 20
 
 
