@@ -125,7 +125,9 @@ def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
     some = count >= _IN_BIN
     centre = np.bincount(where, x, last + 1)[some] / count[some]
     power = np.bincount(where, square, last + 1)[some] / count[some]
-    return centre, 0.5 * np.log(np.maximum(power, 1e-12)), count[some]
+    # Squares less a known variance may be negative; then the least power is one standard error.
+    least = np.sqrt(np.bincount(where, square * square, last + 1)[some]) / count[some]
+    return centre, 0.5 * np.log(np.maximum(np.maximum(power, least), 1e-12)), count[some]
 
 
 def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
@@ -364,7 +366,8 @@ class LoadDependentNoise(Term):
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
             # Subtract the part of the rail's own noise, which the term does not scale.
-            square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
+            # Negative squares are kept: without them, low noise would be overestimated.
+            square = (square - (1.0 - white)) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))
         shares = np.append(_SHARES[:-1:few], 1.0)
