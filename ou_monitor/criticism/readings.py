@@ -91,38 +91,49 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
             notes: list[str]) -> tuple[FloatArray | None, float]:
     """Return the load, and the current at which it is 1, A; NaN if the load is throttle."""
     # t in s, v in V.  The current is the load unless throttle predicts the voltage better.  It is
-    # divided by its 99 % quantile, and shifted by the delay of the voltage.
-    some = slice(None, None, -(-v.size // _EXAMINED))
-    early: list[str] = []
+    # divided by its 99 % quantile.
+    moved: list[str] = []
     if u is not None:
-        # A voltage cannot precede its load, so the stamps of such a throttle are late; a voltage
-        # that follows late is the cause `load_transient`.
-        late, sign = timing(t[some], v[some], u[some])
-        if late > 0.0 and sign > 0.0:
-            u = np.asarray(np.interp(t + late, t, u))
-            early = [f'The voltage answers {number(1e3 * late)} ms before the throttle shows it: '
-                     'the throttle was taken that much earlier.']
+        u, _ = _on_time(t, v, u, 'throttle', moved)
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
-        notes += early
+        notes += moved
         return u, NAN
-    late, sign = timing(t[some], v[some], current[some])
+    said: list[str] = []
+    current, sign = _on_time(t, v, current, 'current', said)
     full = sign * float(np.quantile(np.abs(current), _FULL))
-    if not full:
-        return u, NAN
-    load = np.interp(t + late, t, current) / full
-    gain = _gain(t[some], v[some], load[some]) - (
+    some = _part(v)
+    gain = _gain(t[some], v[some], current[some]) - (
         0.0 if u is None else _gain(t[some], v[some], u[some]))
     limit = 0.5 * _LAGS.size * math.log(v.size)
-    if gain < (limit if u is None else -limit):
-        notes += early
+    if not full or gain < (limit if u is None else -limit):
+        notes += moved
         return u, NAN
     why = 'throttle was not recorded' if u is None else (
         f'it predicts the voltage better than throttle, by {number(gain)} nats' if gain > limit
         else 'it predicts the voltage as well as throttle')
-    notes.append(f'The load is the measured current ({why}). Parameters are for a current of 1 '
-                 f'= {number(full)} A.')
-    return np.asarray(load), full
+    notes += [f'The load is the measured current ({why}). Parameters are for a current of 1 '
+              f'= {number(full)} A.', *said]
+    return current / full, full
+
+
+def _part(v: FloatArray) -> slice:
+    """Return the samples that are examined."""
+    return slice(None, None, -(-v.size // _EXAMINED))
+
+
+def _on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str]
+             ) -> tuple[FloatArray, float]:
+    """Return a load as early as the voltage answers it, and its sign; note by how much."""
+    # A voltage cannot precede its load, so the stamps of such a load are late; a voltage that
+    # follows late is the cause `load_transient`.
+    some = _part(v)
+    late, sign = timing(t[some], v[some], load[some])
+    if not late > 0.0 or (name == 'throttle' and sign < 0.0):
+        return load, sign
+    notes.append(f'The voltage answers {number(1e3 * late)} ms before the {name} shows it: the '
+                 f'{name} was taken that much earlier.')
+    return np.asarray(np.interp(t + late, t, load)), sign
 
 
 def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:

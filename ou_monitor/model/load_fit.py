@@ -123,31 +123,41 @@ def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
     """Return the delay of a load, s, and 1 if voltage falls when the load rises, else -1."""
+    # Shifts are counted in tenths of the sampling step.
     dt = float(np.median(np.diff(t)))
+    unit = dt / _SHIFTS
     slow = min(_SLOWER, 0.3 * float(t[-1] - t[0]))
     left = v - lowpass(v, t, slow)
     late = lowpass(load, t, _LATE)
     loads = np.stack((load, late)) - lowpass(load, t, slow)
+
+    def fit(order: int, *shifts: int) -> tuple[float, float]:
+        """Return squared residuals of differences of an order, and the product with the load."""
+        # The load is the mean of the load at some shifts.
+        X = np.diff(np.mean([[np.interp(t + shift * unit, t, row) for row in loads]
+                             for shift in shifts], axis=0), order)
+        y = np.diff(left, order)
+        product = X @ y
+        return float(y @ y - product @ np.linalg.lstsq(
+            X @ X.T, product, rcond=1e-9)[0]), float(product[0])
+
     found: dict[int, tuple[float, float]] = {}
-
-    def try_around(middle: int, by: int) -> int:
-        """Try shifts around `middle` in steps of `by` samples; return the best shift so far."""
-        for shift in sorted(range(middle - _SHIFTS * by, middle + _SHIFTS * by + 1, by), key=abs):
-            if shift not in found and abs(shift) * dt <= _LATEST:
-                X = np.stack([np.interp(t + shift * dt, t, row) for row in loads])
-                product = X @ left
-                found[shift] = float(left @ left - product @ np.linalg.lstsq(
-                    X @ X.T, product, rcond=1e-9)[0]), float(product[0])
-        return min(found, key=lambda shift: found[shift][0])
-
-    coarse = max(1, math.ceil(_LATEST / dt / _SHIFTS))
-    best = try_around(0, coarse)
-    if coarse > 1:
-        best = try_around(best, math.ceil(coarse / _SHIFTS))
+    coarse, best = max(1, math.ceil(_LATEST / dt / _SHIFTS)), 0
+    for by in (coarse, math.ceil(coarse / _SHIFTS)):
+        for k in range(-_SHIFTS, _SHIFTS + 1):
+            shift = best + k * by * _SHIFTS
+            if shift not in found and abs(shift) * unit <= _LATEST:
+                found[shift] = fit(0, shift)
+        best = min(sorted(found, key=abs), key=lambda shift: found[shift][0])
     # A best shift at the end of the range is not a minimum.
     inside = abs(best) < max(found)
     best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
-    return best * dt, -1.0 if found[best][1] > 0.0 else 1.0
+    # Half a sample beside a steep change of the load leaves errors that look like glitches.  The
+    # interpolation of a noisy load averages it, but averaging in both directions does as well.
+    fine = {k: fit(1, best + k)[0] for k in range(-_SHIFTS, _SHIFTS + 1)}
+    k = min(sorted(fine, key=abs), key=lambda k: fine[k])
+    pays = min(fine[0], fit(1, best + k, best - k)[0]) > fine[k] * t.size ** (1.0 / t.size)
+    return (best + k * pays) * unit, -1.0 if found[best][1] > 0.0 else 1.0
 
 
 class _Noise:
