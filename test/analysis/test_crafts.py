@@ -62,14 +62,15 @@ def test_values_are_called_usual_high_or_low():
         for name in ('sag', 'noise'):
             quiet = {'sag': 4.0 * middle['sag'], 'noise': 0.4 * middle['noise']}
             one = flown(**{**quiet, name: 4.0 * factor * middle[name]})
-            craft = craft_of(one, supply_facts(one))
+            facts = supply_facts(one)
+            craft = craft_of(one, facts)
             assert (craft.cells, craft.cells_from, craft.kind) == (4, 'guessed', QUAD)
             found = {measure.name: measure for measure in craft.measures}
             assert found['resistance'].verdict == 'unknown'
             assert found[name].verdict == verdict, (name, found[name])
             assert found[name].value == pytest.approx(factor * middle[name], rel=0.25)
             assert bool(found[name].remedy) == (verdict != 'usual')
-            known = craft_of(one, supply_facts(one), 4)
+            known = craft_of(one, facts, 4)
             assert f'is {verdict}' in craft_line(known) and not craft_advice(craft)
             assert [found[name].remedy in said for said in craft_advice(known)] == (
                 [True] if verdict == 'high' else [])

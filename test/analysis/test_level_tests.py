@@ -10,6 +10,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
 from scipy import stats
+from scipy.signal import lfilter
 from simulated_recordings import ALPHA, fitted
 
 SIGMA = 0.3156
@@ -101,11 +102,7 @@ def with_effect(name, rng):
 
 def relaxing(kicks):
     """Return steps that relax with ALPHA."""
-    level = np.zeros(kicks.size)
-    phi = math.exp(-ALPHA / 1000.0)
-    for k in range(1, kicks.size):
-        level[k] = phi * level[k - 1] + kicks[k]
-    return level
+    return lfilter([1.0], [1.0, -math.exp(-ALPHA / 1000.0)], kicks)
 
 
 @pytest.mark.parametrize('name', NAMES)

@@ -32,6 +32,10 @@ WHOLE = ('nonlinear_restoring',)
 # Effects of seconds or of throttle are not.
 QUICK = ('measurement_noise', 'quantization', 'held_samples', 'saturation', 'resonance', 'tone',
          'ac_coupling', 'jumps', 'heavy_tails', 'glitches', 'clock_jitter')
+# Effects of seconds and throttle: named alone at 500 Hz as at 1 kHz with each of two base seeds.
+# Transients and switching are not.
+SLOW = ('load_sag', 'load_dependent_sigma', 'load_dependent_alpha', 'load_dependent_noise',
+        'drift', 'second_relaxation', 'throttle_tone', 'volatility', 'flicker_noise')
 # A count fails if it is less probable than this at the required level.
 RARE = 0.01
 TRIES = 3
@@ -41,7 +45,8 @@ def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
     """Return a recording and its hidden effect."""
     short = kind in ('none', 'unknown') or effect in QUICK
     duration = MINUTE if effect in WHOLE else SHORT if short else DURATION
-    hidden = hide(kind, effect, BASE, number, duration=duration, rate=RATE,
+    hidden = hide(kind, effect, BASE, number, duration=duration,
+                  rate=0.5 * RATE if effect in SLOW else RATE,
                   strength=math.sqrt(MINUTE / duration))
     return Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind'), hidden
 
