@@ -78,15 +78,14 @@ def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):
     assert failure(capsys, 'analyze') == "ou-monitor analyze: cannot read 'a b'\n"
 
 
-@pytest.mark.parametrize('encoding', ['utf-8', 'ascii'])
-def test_file_names_that_the_terminal_cannot_show_are_escaped(tmp_path, encoding):
+def test_file_names_that_the_terminal_cannot_show_are_escaped(tmp_path):
     path = os.fsdecode(os.path.join(os.fsencode(tmp_path), b'\xff\xc3\xa4.csv'))
     with open(path, 'w') as file:
         file.writelines(['time_s,voltage_v\n', '0,5\n', '1,5\n', '2,5\n'])
     page = tmp_path / 'page.html'
     done = subprocess.run(
         [sys.executable, '-m', 'ou_monitor.cli.main', 'analyze', path, '--report', str(page)],
-        env={**os.environ, 'PYTHONIOENCODING': encoding}, capture_output=True)
+        env={**os.environ, 'PYTHONIOENCODING': 'ascii'}, capture_output=True)
     assert (done.returncode, done.stderr) == (0, b'')
     assert b'\\udcff' in done.stdout
     assert '\\udcff\xe4.csv' in page.read_text(encoding='utf-8')
