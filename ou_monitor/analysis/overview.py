@@ -15,6 +15,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult, ProcessType
 from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
+from ou_monitor.analysis.quality import beware
 from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
 from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
@@ -66,6 +67,7 @@ class Overview:
     # Fit of the whole recording, if that is one stationary level, and if the fit is more precise
     # than `facts.ou` and agrees with it.
     whole: OuFacts | None = None
+    beware: tuple[str, ...] = ()  # Warnings that change the meaning of every number
 
     @property
     def limit(self) -> float:
@@ -98,7 +100,8 @@ def overview(recording: Recording, limit: float | None = None,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
                     _largest(recording.current), _growth(recording, facts.noise.rms_v, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
-                    _strongest(levels), cells, end, _whole(levels, recording, facts.ou))
+                    _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
+                    beware(recording))
 
 
 def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:

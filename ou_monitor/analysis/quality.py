@@ -36,6 +36,13 @@ _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
 _TRIM, _RARE = 0.05, 0.01
 # Minimum samples for a statement on the ADC.
 _FEWEST = 64
+# Warnings that change the meaning of every number.
+_BEWARE = {
+    'VOLTAGE_SIGN': (
+        'Beware: the voltage is negative throughout: swap the leads of the sensor, or change the '
+        'sign.'),
+    'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
+    'TIME_UNIT': 'Beware: the time seems to be in a smaller unit.'}
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,11 @@ def _fit_doubts(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items += [(flag.name, Severity.INFO if flag in _INFORMS else Severity.WARNING, flag.value)
               for flag in e.flags]
     return items
+
+
+def beware(recording: Recording) -> tuple[str, ...]:
+    """Return the warnings that change the meaning of every number, for the first lines."""
+    return tuple(_BEWARE[item.name] for item in _unit_items(recording) if item.name in _BEWARE)
 
 
 def _unit_items(recording: Recording) -> list[QualityItem]:

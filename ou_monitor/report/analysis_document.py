@@ -33,13 +33,6 @@ _MAX_DRAWN, _MAX_MARKED = 6, 3
 _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
           'gaussian': 'not Gaussian', 'impulses': 'impulses', 'correlated': 'correlated',
           'one_relaxation': 'not one relaxation', 'second_relaxation': 'second relaxation'}
-# Warnings that change the meaning of every number.
-_BEWARE = {
-    'VOLTAGE_SIGN': (
-        'Beware: the voltage is negative throughout: swap the leads of the sensor, or change the '
-        'sign.'),
-    'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
-    'TIME_UNIT': 'Beware: the time seems to be in a smaller unit.'}
 
 
 def analysis_document(analysis: Analysis, command: str = '') -> Document:
@@ -71,7 +64,6 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
 def answer(analysis: Analysis) -> list[str]:
     """Return the answer: doubts, lowest voltage, safe throttle, and sigma and tau if known."""
     curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
-    beware = [words for name, words in _BEWARE.items() if name in names]
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
         f'At the end, safe up to {100.0 * curves.budget:.0f} % throttle for {curves.horizon:g} s'
@@ -81,7 +73,7 @@ def answer(analysis: Analysis) -> list[str]:
         f'{_why_no_throttle(analysis)}.']
     supply = [first, *safe, *others, *craft_advice(analysis.craft)]
     # If the voltage has the wrong sign, only its noise has a meaning.
-    return [*beware, *([] if 'VOLTAGE_SIGN' in names else supply), *_numbers(analysis),
+    return [*analysis.overview.beware, *([] if 'VOLTAGE_SIGN' in names else supply), *_numbers(analysis),
             *_change(analysis)]
 
 

@@ -42,7 +42,8 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
              f'at least as much as the recording; at {100.0 * LEVEL:g} % or less the recording is '
              'reported to differ.',
              legend=True)]
-    return Document('Compared with its simulation', subject, _answer(found), parts, command)
+    return Document('Compared with its simulation', subject, [*seen.beware, *_answer(found)],
+                    parts, command)
 
 
 def _answer(found: Agreement) -> list[str]:

@@ -35,7 +35,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
         Section('What to know before using these numbers',
                 [Notes.of(dict.fromkeys([*recording.notes, *lost, *gaps, *found.notes]))])]
     return Document(f'Supply noise in {name}', subject,
-                    [_answer(found, name, per), answers(seen)[0]], parts, command)
+                    [*seen.beware, _answer(found, name, per), answers(seen)[0]], parts, command)
 
 
 def _answer(found: Coupling, name: str, per: str) -> str:

@@ -56,7 +56,9 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
                   Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
     parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
-    return Document('What the simulation gets wrong', subject, finding.words, parts, command)
+    beware = () if seen is None else seen.beware
+    return Document('What the simulation gets wrong', subject, [*beware, *finding.words], parts,
+                    command)
 
 
 def _inputs(finding: Finding) -> str:
@@ -159,9 +161,10 @@ def _under_load(finding: Finding) -> str:
         return ''
     factor, unit = (finding.full, ' A') if load == 'current' else (1.0, '')
     low, high = (number(factor * end, 2) + unit for end in (fall.low, fall.high))
-    found = (f'Where {load} is {high} or more, the median voltage is {number(fall.measured, 2)} V '
-             f'lower than where it is {low} or less (drift included); the model gives '
-             f'{number(fall.explained, 2)} V'
+    sign, way = (1.0, 'lower') if fall.measured >= 0.0 else (-1.0, 'higher')
+    found = (f'Where {load} is {high} or more, the median voltage is '
+             f'{number(sign * fall.measured, 2)} V {way} than where it is {low} or less (drift '
+             f'included); the model gives {number(sign * fall.explained, 2)} V'
              + ('.' if fall.fits else ': trust the readings.'))
     if dips.count and dips.made is not None:
         made = (f'caused {dips.made} of the {dips.count} dips' if dips.count > 1 else
