@@ -73,8 +73,8 @@ def answer(analysis: Analysis) -> list[str]:
         f'{_why_no_throttle(analysis)}.']
     supply = [first, *safe, *others, *craft_advice(analysis.craft)]
     # If the voltage has the wrong sign, only its noise has a meaning.
-    return [*analysis.overview.beware, *([] if 'VOLTAGE_SIGN' in names else supply), *_numbers(analysis),
-            *_change(analysis)]
+    return [*analysis.overview.beware, *([] if 'VOLTAGE_SIGN' in names else supply),
+            *_numbers(analysis), *_change(analysis)]
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
