@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ou_monitor.analysis.coupling import Coupling
     from ou_monitor.analysis.supply import SupplyFacts
     from ou_monitor.model.supply import SupplyModel
-    from ou_monitor.paper.design import Flight, FlownRisk
+    from ou_monitor.paper.design import Flight
     from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.recordings.model_file import ModelFile
     from ou_monitor.simulation import Profile, Run
@@ -341,8 +341,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     recording : Recording or path, optional
         Flight that gives level, sag, resistance and noise.
     network : mapping, optional
-        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``; they override
-        measured values.
+        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``. A resistance
+        or voltage that the recording shows is changed to the value given; components that it does
+        not show are those of the recorded craft.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
@@ -437,12 +438,13 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if rail != 'bus' and voltage is None:
             level, source = default_voltage(0, circuit.regulator_voltage)
         assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
+        share = circuit.battery_resistance / flight.resistance if flight.resistance > 0.0 else 1.0
         taken = taken_words(flight, circuit, throttle, assumed, origin)
         error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
             throttle, flight.throttle, flight.sag))
-        if facts.budget is not None and not values.keys() & SHOWN and math.isfinite(
-                facts.budget.throttle):
-            known = risk_of
+        if risk_of is not None and not values.keys() & SHOWN and facts.budget is not None and (
+                math.isfinite(facts.budget.throttle)):
+            known = partial(risk_of, share=share, rise=circuit.battery_voltage - flight.level)
     found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
                      esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST),
                      sag_error=error, flown=known, assumed=assumed)
@@ -451,7 +453,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
 
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
-            risk: float) -> tuple[Flight, SupplyFacts, FlownRisk | None]:
+            risk: float) -> tuple[Flight, SupplyFacts, Callable[..., float] | None]:
     """Return a flight in numbers, its facts, and its final risk as a function (full, level: V)."""
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
@@ -471,13 +473,18 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
     facts, load, _ = facts_and_end(recording, level, monitor=monitor)
 
     @cache
-    def over_throttle(sag: float, noise: float) -> FloatArray:
-        assert monitor is not None
+    def over_throttle(sag: float, noise: float, rise: float) -> FloatArray:
+        assert monitor is not None and level is not None
         # The logarithm is interpolated, as for the throttle budget.
-        return np.asarray(np.log(np.maximum(monitor.changed_risk(sag, noise), 1e-300)))
+        return np.asarray(np.log(np.maximum(
+            monitor.changed_risk(sag, noise, level - rise), 1e-300)))
 
-    def risk_at(throttle: float, sag: float, noise: float) -> float:
-        risks = over_throttle(sag, noise)
+    def risk_at(throttle: float, sag: float, noise: float, *, share: float, rise: float) -> float:
+        # share: resistance over the recorded one; rise of the battery voltage, V.
+        risks = over_throttle(share * sag, noise, rise)
+        if share < 1.0:
+            # Less resistance cannot raise the risk; with the error of the level it may seem to.
+            risks = np.minimum(risks, over_throttle(1.0, noise, rise))
         return float(np.exp(np.interp(throttle, np.linspace(0.0, 1.0, risks.size), risks)))
 
     return Flight(load.level, full, cells, facts.sag.throttle, facts.sag.sag_v, facts.sag.se_v,

@@ -439,9 +439,9 @@ class SupplyMonitor:
             return NAN
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
 
-    def changed_risk(self, sag: float, noise: float) -> FloatArray:
-        """Return the budget's risks, (51,), with sag and noise variance multiplied by factors."""
-        level, ahead = self._checked(None, None)
+    def changed_risk(self, sag: float, noise: float, voltage: float) -> FloatArray:
+        """Return the risks over throttle, (51,), with sag and noise variance multiplied."""
+        level, ahead = self._checked(voltage, None)
         return risk_over_throttle(self._forecast, level, ahead, sag, noise)
 
     @property

@@ -15,12 +15,15 @@ by up to 1.44 times in 39 of 6000 random networks.
 `network_of` chooses components that reproduce a flight. All risks of its bus are then computed as
 the live risk at the end of the flight, which also gives the throttle budget of `analyze`. For
 other components, the sag is scaled with the resistance, and the noise with the noise of the
-network. The risks include the errors of sag and level and what throttle did not explain. Limits:
-sag and noise are as measured, including the white noise and the filter of the sensor. Noise added
-by changes of throttle, and an OU if one was found, count as slow fluctuations of the current,
-which capacitors on a board do not change; the rest is attributed to the switching of the ESCs.
-Without a measured current, the resistance is the given or default one, and the current is scaled
-to fit the sag: the effect of packs in parallel is still right, the effect of an ESR uncertain.
+network. A given resistance or battery voltage changes the risk as a row of the table does: the
+current remains that of the recorded resistance. A component that the recording does not show (the
+capacitor, or the resistance without a measured current) is that of the recorded craft. The risks
+include the errors of sag and level and what throttle did not explain. Limits: sag and noise are as
+measured, including the white noise and the filter of the sensor. Noise added by changes of
+throttle, and an OU if one was found, count as slow fluctuations of the current, which capacitors
+on a board do not change; the rest is attributed to the switching of the ESCs. Without a measured
+current, the resistance is the given or default one, and the current is scaled to fit the sag: the
+effect of packs in parallel is still right, the effect of an ESR uncertain.
 """
 
 from __future__ import annotations
@@ -481,9 +484,8 @@ class Flight:
     var_inf: float  # Variance of the OU, V^2
 
 
-# Components that a flight shows; if one is given, the risk of the flight does not apply.
-SHOWN = frozenset(('battery_voltage', 'battery_resistance', 'current_max', 'current_exponent',
-                   'switching_scale', 'flutter'))
+# Components that, if given, replace the load of a flight, so that its risk does not apply.
+SHOWN = frozenset(('current_max', 'current_exponent', 'switching_scale', 'flutter'))
 
 
 def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerNetwork:
@@ -497,10 +499,11 @@ def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerN
         raise ValueError('the recording does not show its sag: throttle and voltage must move')
     if not math.isfinite(rms):
         raise ValueError(f'the recording does not show the noise at throttle {throttle:g}')
-    values: dict[str, Any] = {'battery_voltage': flight.level}
+    values: dict[str, Any] = {'battery_voltage': flight.level, **given}
     if flight.resistance > 0.0:
+        # The current and the noise are those of the recorded resistance, not of a changed one.
         values['battery_resistance'] = flight.resistance
-    network = PowerNetwork(**completed({**values, **given}))
+    network = PowerNetwork(**completed(values))
     seen = (u >= max(_FROM, low)) & (u <= high) & (sag > 0.0)
     if 'current_exponent' not in given and seen.sum() > 1:
         slope = float(np.polyfit(np.log(u[seen]), np.log(sag[seen]), 1)[0])
@@ -522,4 +525,5 @@ def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerN
         unit: dict[str, Any] = {name: 1.0}
         one = rail_at(replace(quiet, **unit), throttle).var_inf - base
         scales[name] = math.sqrt(max(0.0, variance) / one) if one > 0.0 else 0.0
-    return replace(quiet, **{name: value for name, value in scales.items() if name not in given})
+    return replace(quiet, **{**scales, **{
+        name: given[name] for name in (*scales, 'battery_resistance') if name in given}})

@@ -81,8 +81,10 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
         ' Regulators that it feeds are left out: their current is in the recorded voltage.')
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
-    return (f'From the recording: {flight.level:.4g} V without load at its end (by the load '
-            f'model; the risks include its error), {cells} (highest median of 0.5 s '
+    changed = '' if math.isclose(network.battery_voltage, flight.level) else (
+        f', changed to {network.battery_voltage:.4g} V')
+    return (f'From the recording: {flight.level:.4g} V without load at its end{changed} (by the '
+            f'load model; the risks include its error), {cells} (highest median of 0.5 s '
             f'{flight.full:.4g} V; --cells N for a pack of N cells), sag '
             f'{sag:.3g} V (+- {2.0 * se:.2g} V, included in the risks, which are computed as in '
             'analyze, with the sag and noise of each row) and noise '
@@ -90,8 +92,12 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
             f'{percent(throttle)} throttle, resistance '
             + ('unknown without a measured current (--set battery_resistance=OHM): it is shown '
                'relative to the present one.' if assumed else
-               f'{1e3 * network.battery_resistance:.3g} mOhm.')
+               f'{1e3 * network.battery_resistance:.3g} mOhm'
+               + (f' in place of the recorded {1e3 * flight.resistance:.3g} mOhm, at the recorded '
+                  'current.' if flight.resistance > 0.0 and not math.isclose(
+                      network.battery_resistance, flight.resistance) else '.'))
             + ('' if math.isfinite(flight.alpha) else ' It shows no relaxation: alpha of slow '
                f'noise is assumed to be {number(network.flutter_rate)} 1/s.')
             + regulator
-            + ' A recording shows neither bulk capacitor nor ESR: --set bulk_capacitance=470uF.')
+            + ' A recording shows neither bulk capacitor nor ESR: state those of the recorded '
+            'craft (--set bulk_capacitance=470uF).')

@@ -190,7 +190,7 @@ def test_set_values_override_the_flight(flight, capsys):
                   '0.5', '--cells', '4', '--brownout-voltage', '3.2')
     assert found['brownout_voltage'] == pytest.approx(12.8)
     assert found['network']['battery_resistance'] == 0.05
-    assert found['present']['sag'] == pytest.approx(0.025 * 80.0 * 0.5 ** 1.5, rel=0.15)
+    assert found['present']['sag'] == pytest.approx(0.05 * 80.0 * 0.5 ** 1.5, rel=0.15)
     assert main(['design', '--from', str(flight), '--set', 'cells=3']) == 2
     assert 'it is likely 4' in capsys.readouterr().err
 
@@ -292,6 +292,75 @@ def test_each_lever_shows_its_effect(flight, capsys):
     none = asked(capsys, '--from', flight, '--voltage', '16.15')
     assert 'would be enough' in none['answer']
     assert all(one['least'] is None for one in none['levers'])
+
+
+def test_a_row_of_the_table_is_the_run_with_that_value(flight, capsys):
+    """Resistance, packs and throttle: each value and its risk, there and back."""
+    def run(*more):
+        return asked(capsys, '--from', flight, '--voltage', '14.9', *more)
+
+    def ohms(value):
+        return '--set', f'battery_resistance={value!r}'
+
+    def lever(found, name):
+        return next(one for one in found['levers'] if one['name'] == name)
+
+    recorded = run()
+    ohm, risk = recorded['network']['battery_resistance'], recorded['present']['risk']
+    for name, share in (('battery and lead resistance', 0.75), ('packs in parallel', 0.5)):
+        there, back = run(*ohms(share * ohm)), run(*ohms(ohm / share))
+        assert there['present']['risk'] == pytest.approx(lever(recorded, name)['risk'], rel=1e-6)
+        assert there['present']['risk'] < risk < back['present']['risk']
+        assert lever(back, name)['risk'] == pytest.approx(risk, rel=1e-6)
+        # The level lies at one resistance.
+        assert there['resistance_at_level'] == pytest.approx(recorded['resistance_at_level'])
+        assert there['present']['sag'] == pytest.approx(share * recorded['present']['sag'])
+    needed = lever(recorded, 'battery and lead resistance')['least'] / 1e3
+    assert run(*ohms(needed))['present']['risk'] == pytest.approx(0.01, rel=1e-3)
+    u, limit = recorded['throttle'], lever(recorded, 'throttle limit')['risk']
+    assert run('--throttle', repr(0.8 * u))['present']['risk'] == pytest.approx(limit, rel=1e-6)
+    back = run('--throttle', repr(u / 0.8))
+    assert lever(back, 'throttle limit')['risk'] == pytest.approx(risk, rel=1e-6)
+    # A higher level is a lower limit.
+    level = recorded['network']['battery_voltage']
+    full = run('--set', f'battery_voltage={level + 0.3!r}')
+    lower = asked(capsys, '--from', flight, '--voltage', '14.6')
+    assert full['present']['risk'] == pytest.approx(lower['present']['risk'], rel=0.02)
+
+
+def test_a_capacitor_of_the_recorded_craft_is_stated(flight, capsys):
+    """It was there: the risk of the flight stays, and the table begins at it."""
+    plain, stated = (asked(capsys, '--from', flight, '--voltage', '14.9', *more)
+                     for more in ((), ('--set', 'bulk_capacitance=940uF')))
+    assert stated['present']['capacitance'] == pytest.approx(940e-6)
+    assert stated['present']['risk'] == pytest.approx(plain['present']['risk'], rel=1e-9)
+    # Without a current, so is the resistance.
+    plain, stated = (asked(capsys, '--from', flight, '--voltage', '14.9', '--current-column',
+                           'none', *more)
+                     for more in ((), ('--set', 'battery_resistance=20mOhm')))
+    assert [one['risk'] for one in stated['levers'][1:]] == pytest.approx(
+        [one['risk'] for one in plain['levers'][1:]], rel=1e-9)
+
+
+@pytest.mark.parametrize('resistance', ['20mOhm', '40mOhm'])
+def test_a_row_of_a_network_is_the_run_with_that_value(resistance, capsys):
+    """Without a recording, also the capacitance: the same network, so the same risk."""
+    def run(throttle, **values):
+        return asked(capsys, '--throttle', throttle, '--set', f'battery_resistance={resistance}',
+                     *(word for name, value in values.items()
+                       for word in ('--set', f'{name}={value!r}')))
+
+    first = run(0.3)
+    levers = {one['name']: one for one in first['levers']}
+    ohm = first['network']['battery_resistance']
+    for name, other in (
+            ('bulk capacitance', run(0.3, bulk_capacitance=940e-6, bulk_esr=0.015)),
+            ('packs in parallel', run(0.3, battery_resistance=0.5 * ohm)),
+            ('battery and lead resistance', run(0.3, battery_resistance=0.75 * ohm)),
+            ('throttle limit', run(0.24))):
+        assert levers[name]['risk'] == pytest.approx(other['present']['risk'], rel=1e-6), name
+    back = run(0.3, bulk_capacitance=235e-6, bulk_esr=0.06)
+    assert back['levers'][0]['risk'] == pytest.approx(first['present']['risk'], rel=1e-6)
 
 
 @pytest.mark.parametrize('limit, risk', [(14.9, 0.01), (14.9, 0.05), (16.15, 0.01)])
