@@ -70,7 +70,8 @@ def test_newton_finds_the_top_that_is_near(start):
 
     at, most, errors = refine(values, start)
     assert 5.0 - most < 0.05 and most == pytest.approx(float(values(at[None])[0]))
-    assert errors == pytest.approx(1.0 / np.sqrt(np.diag(bend)), rel=1e-6)
+    assert errors == pytest.approx(np.sqrt(np.diag(np.linalg.inv(bend))), rel=1e-6)
+    assert curvature_se(lambda x: float(values(x[None])[0]), top) == pytest.approx(errors)
 
 
 def test_newton_gives_up_where_nothing_is_curved():

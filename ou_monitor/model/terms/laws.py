@@ -69,15 +69,39 @@ def climb(value: Callable[[FloatArray], float], start: Sequence[float] | FloatAr
 
 def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: float = 0.05
                  ) -> FloatArray:
-    """Return standard errors from the curvature of a log-likelihood along each axis."""
-    top = value(at)
-    errors = np.full(at.size, math.nan)
-    for k in range(at.size):
-        move = np.zeros(at.size)
-        move[k] = step
-        bend = (value(at + move) - 2.0 * top + value(at - move)) / step**2
-        if bend < 0.0:
-            errors[k] = 1.0 / math.sqrt(-bend)
+    """Return the joint standard errors at a maximum of a log-likelihood; NaN if undetermined."""
+    found = np.array([value(x) for x in at + _around(at.size, step)])
+    return _errors(_parabola(found, at.size, step)[1])
+
+
+def _around(size: int, step: float) -> FloatArray:
+    """Return moves that determine a parabola: none, along each axis, along each pair of axes."""
+    moves, pairs = step * np.eye(size), np.triu_indices(size, 1)
+    both = moves[pairs[0]] + moves[pairs[1]]
+    # Central differences, because one-sided ones are biased by the third derivative.
+    return np.concatenate((np.zeros((1, size)), moves, -moves, both, -both))
+
+
+def _parabola(found: FloatArray, size: int, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return gradient and second derivatives from the values at the points of `_around`."""
+    with np.errstate(invalid='ignore'):
+        top, up, down = found[0], found[1:size + 1], found[size + 1:2 * size + 1]
+        bend, pairs = np.diag((up - 2.0 * top + down) / step**2), np.triu_indices(size, 1)
+        sides = found[2 * size + 1:].reshape(2, -1).sum(axis=0)
+        alone = up + down - top
+        bend[pairs] = (sides - alone[pairs[0]] - alone[pairs[1]]) / (2.0 * step**2)
+        return (up - down) / (2.0 * step), bend + np.triu(bend, 1).T
+
+
+def _errors(bend: FloatArray) -> FloatArray:
+    """Return joint standard errors from second derivatives of a log-likelihood."""
+    errors, slope = np.full(bend.shape[0], math.nan), bend.diagonal()
+    # A parameter that changes nothing, or lies at a limit, does not affect the others' errors.
+    kept = np.flatnonzero(np.isfinite(slope) & (slope < 0.0))
+    scale = np.sqrt(-slope[kept])
+    curve, axes = np.linalg.eigh(-bend[np.ix_(kept, kept)] / np.outer(scale, scale))
+    if (curve > 0.0).all():
+        errors[kept] = np.sqrt((axes**2 / curve).sum(axis=1)) / scale
     return errors
 
 
@@ -85,22 +109,12 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
            step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
     """Return position, value and errors of a maximum near `start` by Newton steps, or None."""
     x = np.asarray(start, dtype=np.float64)
-    size = x.size
-    moves, pairs = step * np.eye(size), np.triu_indices(size, 1)
-    both = moves[pairs[0]] + moves[pairs[1]]
-    around = np.concatenate(([np.zeros(size)], moves, -moves, both, -both))
     turn = 0
     while True:
-        found = values(x + around)
+        found = values(x + _around(x.size, step))
         if not np.isfinite(found).all():
             return None
-        top, up, down = found[0], found[1:size + 1], found[size + 1:2 * size + 1]
-        gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
-        # Central differences, because one-sided ones are biased by the third derivative.
-        sides = found[2 * size + 1:].reshape(2, -1).sum(axis=0)
-        alone = up + down - top
-        bend[pairs] = (sides - alone[pairs[0]] - alone[pairs[1]]) / (2.0 * step**2)
-        bend += np.triu(bend, 1).T
+        top, (gradient, bend) = found[0], _parabola(found, x.size, step)
         curve, axes = np.linalg.eigh(bend)
         if curve[0] >= 0.0:
             return None
@@ -110,7 +124,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         ends = x + np.clip(by, -0.5, 0.5) * _SHARES[:, None]
         further = values(ends) if gain >= _FLAT and turn < _NEWTON else found[:1]
         if not further.max() > top:
-            return x, float(top), np.sqrt(1.0 / np.maximum(-np.diag(bend), 1e-300))
+            return x, float(top), _errors(bend)
         x, turn = ends[int(np.argmax(further))], turn + 1
 
 

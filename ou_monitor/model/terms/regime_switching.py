@@ -152,14 +152,17 @@ def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray
     return direct
 
 
-def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
+def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2,
+             middle: float | None = None
              ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
     """Return the arguments of `forward`, then means, (states, states, n), and stds by states."""
+    # middle: the mean of the states, in levels; by default the stationary law's.
     state = np.arange(states, dtype=np.float64)
     chances = step_chances(x, s.step, states)
     law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
+    middle = float(law @ state) if middle is None else middle
     std = np.exp(x[4] + x[3] * state)
-    mean = x[2] * s.unit * (_direct(s, at_once, float(law @ state), states) - s.followed)
+    mean = x[2] * s.unit * (_direct(s, at_once, middle, states) - s.followed)
     log = np.empty((states, states, s.z.size))
     for i, j in np.ndindex(states, states):
         log[i, j] = log_normal(s.z, mean[i, j], float(std[j]) ** 2)
@@ -498,10 +501,10 @@ class RegimeSwitching(Term):
         part = slice(view.train.start, min(view.train.stop, view.train.start + _LONG))
         within = scores.part(part).following(starts[0], at_once, states)
 
-        def value(x: FloatArray) -> float:
+        def value(x: FloatArray, middle: float | None = None) -> float:
             if not _is_inside(x, view):
                 return -math.inf
-            return log_likelihood(*chain_of(within, x, at_once, states)[0])
+            return log_likelihood(*chain_of(within, x, at_once, states, middle)[0])
 
         start = max(starts, key=value)
         if states == 2:
@@ -520,7 +523,9 @@ class RegimeSwitching(Term):
         normal = normal_scores(chance)
         term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]),
                    at_once, float(states))
-        e = curvature_se(value, x)
+        # `u0` is fitted too, so the rates do not move the levels.
+        middle = float(chain[2] @ np.arange(states))
+        e = curvature_se(lambda x: value(x, middle), x)
         se = {'rate_up': term.rate_up * float(e[0]), 'rate_down': term.rate_down * float(e[1]),
               'level': unit * float(e[2]), 'sigma_ratio': term.sigma_ratio * float(e[3])}
         after = smoothed(*chain) @ np.arange(states)
