@@ -17,6 +17,7 @@ from ou_monitor.model.terms.slow import FlickerNoise, SecondRelaxation
 from ou_monitor.model.terms.volatility import Volatility
 from ou_monitor.model.whittle import Ordinates
 import pytest
+from scipy.signal import lfilter
 
 
 def test_parameters_that_fit_a_part_but_not_all_samples_are_rejected(monkeypatch):
@@ -66,6 +67,45 @@ def test_simulations_of_the_fit_spread_as_far_as_the_data(law):
     model = SupplyModel(again.terms)
     spread = [model.simulate(T, np.random.default_rng(k), None).std() for k in range(12)]
     assert np.median(spread) == pytest.approx(voltage.std(), rel=0.3)
+
+
+@pytest.mark.parametrize('level, at_once, rates', [
+    (0.2, True, (0.5, 2.0)), (-0.2, True, (0.4, 0.8)), (0.25, False, (0.6, 0.2))])
+def test_a_simulation_of_switching_has_the_mean_and_dips_of_the_data(level, at_once, rates):
+    """Two levels, 600 s at 50 Hz; errors of the rates are at least those of counting switches."""
+    rng, n, rate = np.random.default_rng(7), 30_000, 50.0
+    high, states = 0, []
+    for u in rng.random(n).tolist():
+        high ^= u < rates[high] / rate
+        states.append(high)
+    moved = level * np.array(states)
+    phi = math.exp(-8.0 / rate)
+    e = 0.05 * math.sqrt(1.0 - phi * phi) * rng.standard_normal(n)
+    if not at_once:
+        e += (1.0 - phi) * moved
+    voltage = 11.5 + lfilter([1.0], [1.0, -phi], e) + at_once * moved
+    samples, whole = Samples(np.arange(n) / rate, voltage, None), slice(0, n)
+    plain = fit_composite(samples, [guess(samples)], whole)
+    found = fit_composite(samples, [plain.terms[0], RegimeSwitching], whole)
+    switching, se = found.terms[-1], found.se[-1]
+    changes = int(np.count_nonzero(np.diff(states)))
+    for name, truth in zip(('rate_up', 'rate_down'), rates[::-1 if level < 0.0 else 1]):
+        error = se[name] / getattr(switching, name)
+        assert 1.0 / math.sqrt(changes) < error < 4.0 / math.sqrt(changes)
+        assert abs(math.log(getattr(switching, name) / truth)) < 4.0 * error
+    low = float(np.quantile(voltage, 0.01))
+
+    def dips(v):
+        return int(np.count_nonzero((v[1:] < low) & (v[:-1] >= low)))
+
+    share = rates[0] / sum(rates)
+    # The share of time in a state is known from the switches alone.
+    error = abs(level) * math.sqrt(2.0 * share * (1.0 - share) / (sum(rates) * 600.0))
+    drawn = [SupplyModel(found.terms).simulate(samples.t, np.random.default_rng(k), None)
+             for k in range(8)]
+    assert abs(np.mean(drawn) - voltage.mean()) < 4.0 * error / math.sqrt(8.0)
+    # The number of dips scatters by an eighth from simulation to simulation.
+    assert np.mean([dips(v) for v in drawn]) == pytest.approx(dips(voltage), rel=0.3)
 
 
 ALPHA, SIGMA, SLOW = 60.0, 0.5, 2.5

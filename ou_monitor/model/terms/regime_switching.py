@@ -342,11 +342,12 @@ _MOST = 5_000_000
 @dataclass(frozen=True)
 class RegimeSwitching(Term):
     """
-    Switch between two or three states; each higher state adds `level` and multiplies sigma.
+    Switch between two or three states, `level` apart; each higher one multiplies sigma.
 
-    The rate from a state to each higher one is `rate_up`, to each lower one `rate_down`.
-    Exact in law: switching times are drawn, and sigma is integrated over the parts of a
-    step in which it is constant.
+    The level `u0` of the `ou` is the mean over the states, its sigma the lowest state's.  The rate
+    from a state to each higher one is `rate_up`, to each lower one `rate_down`.  Exact in law:
+    switching times are drawn, and sigma is integrated over the parts of a step in which it is
+    constant.
     """
 
     NAME: ClassVar[str] = 'regime_switching'
@@ -367,7 +368,7 @@ class RegimeSwitching(Term):
 
     rate_up: float = parameter('1/s', 'rate of switching to each higher state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of switching to each lower state', 0.0, above=True)
-    level: float = parameter('V', 'voltage that each further state adds')
+    level: float = parameter('V', 'voltage of a state less that of the state below')
     sigma_ratio: float = parameter('', 'ratio of sigma to sigma in the state below', 0.0)
     at_once: float = parameter(
         '', 'share of the level that acts at once; the rest relaxes at alpha', 0.0, 1.0)
@@ -382,16 +383,17 @@ class RegimeSwitching(Term):
         """Begin a simulation."""
         count = int(self.states)
         rates = rates_between(self.rate_up, self.rate_down, count)
-        leave = rates.sum(axis=1)
+        law, leave = stationary_law(rates), rates.sum(axis=1)
+        middle = float(law @ np.arange(count))
         now_in = 0
         next_at = math.nan
 
         def effect(s: Segment) -> None:
             nonlocal now_in, next_at
             if math.isnan(next_at):
-                now_in = _pick(rng, stationary_law(rates))
+                now_in = _pick(rng, law)
                 next_at = float(s.at[0]) + rng.standard_exponential() / leave[now_in]
-            changes = float(stationary_law(rates) @ leave)
+            changes = float(law @ leave)
             if changes * (s.at[-1] - next_at) > _MOST:
                 raise ValueError(f'{self.NAME}: {changes:g} changes a second exceed the limit of '
                                  f'{_MOST} per segment of samples; model them as noise')
@@ -407,13 +409,13 @@ class RegimeSwitching(Term):
             # The state at each sample, and at the beginning of each step.
             now = entered[np.searchsorted(when, s.at, side='right')]
             before = np.concatenate(([entered[0]], now[:-1]))
-            s.level += self.at_once * self.level * now
+            s.level += self.at_once * self.level * (now - middle)
             # A change within a step affects only the share of the pull and of the noise that
             # comes after it.
             k = np.searchsorted(s.at, when)
             slow = (1.0 - self.at_once) * self.level
             if slow != 0.0:
-                push = before * -np.expm1(-s.alpha * s.step)
+                push = (before - middle) * -np.expm1(-s.alpha * s.step)
                 np.add.at(push, k, -np.expm1(-s.alpha[k] * (s.at[k] - when)) * np.diff(entered))
                 s.push += slow * push
             if self.sigma_ratio == 1.0:
