@@ -382,6 +382,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     """
     from ou_monitor.analysis.crafts import (
         cells_of, check_cells, full_voltage, pack_limit, stated_limit)
+    from ou_monitor.analysis.quality import faults
     from ou_monitor.paper.network import completed, PowerNetwork
     from ou_monitor.paper.design import (
         as_data, default_voltage, design as designed, LEAST, MOST, network_of,
@@ -406,6 +407,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
               (0, circuit.regulator_voltage)))
     else:
         flown = supplied(readings_of(_read(recording)))
+        if wrong := faults(flown):
+            raise InputError(f'{flown.name}: {wrong[0].text}')
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells, origin = (values['cells'], 'given') if 'cells' in values else cells_of(flown)
         values['cells'] = cells

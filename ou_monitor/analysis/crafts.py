@@ -18,6 +18,7 @@ import numpy as np
 from ou_monitor.analysis.noise import flown_near
 from ou_monitor.analysis.supply import SupplyFacts
 from ou_monitor.errors import InputError
+from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import NAN, plain_data, Recording
 from ou_monitor.text import counted, number
 
@@ -31,6 +32,8 @@ HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
 # Lowest voltage of a cell at which a supply is guessed to be a pack, V: pilots are warned below it
 # (vbat_warning_cell_voltage of Betaflight).  Rails of 3.3, 5, 6, 9 and 10 V are no packs then.
 _PACK = 3.5
+# Largest pack that is guessed: 100 V, the limit of usual ESCs of high voltage.
+_MOST_GUESSED = 24
 # Voltage at rest that a guess of the cells prefers, V: between full (4.2) and half full (3.8).
 _HALF = 4.0
 # Cells of usual LiFePO4 packs, and the range of the plateau of such a cell at rest, V.
@@ -133,7 +136,7 @@ def cell_count(full: float) -> int:
     if not (math.isfinite(full) and full > 0.0):
         return 0
     least = math.ceil(full / HIGHEST_CELL)
-    likely = range(least, int(full / _PACK) + 1)
+    likely = range(least, min(int(full / _PACK), _MOST_GUESSED) + 1)
     return min(likely, key=lambda cells: abs(full / cells - _HALF), default=0)
 
 
@@ -147,10 +150,19 @@ def check_cells(full: float, cells: int) -> None:
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: '
-            + (f'it is likely {counted(likely, "cell")} (lithium)' if (likely := cell_count(full))
+            + ('the voltage seems to be in mV or counts (--unit mV)' if full > MOST_SUPPLY else
+               f'it is likely {counted(likely, "cell")} (lithium)' if (likely := cell_count(full))
                else 'no number of charged lithium cells fits')
             + '; for lead-acid, or a rail that is no battery, leave --cells out and give '
             '--brownout-voltage V')
+
+
+def doubtful_cells(full: float, cells: int) -> str:
+    """Return the doubt about cells that hardly fit the voltage at rest, V; empty without one."""
+    likely = cell_count(full)
+    return '' if not (0 < likely < cells and full / cells < _BEGINS) else (
+        f'{full:.4g} V at rest would be {full / cells:.3g} V per cell: the pack is damaged, or it '
+        f'has {counted(likely, "cell")}, not {cells}.')
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:
@@ -246,7 +258,9 @@ def craft_line(craft: Craft) -> str:
     iron = next((n for n in _IRON_CELLS if _IRON[0] <= craft.full_v / n <= _IRON[1]), 0)
     source = {'log': ' (from the log)', 'guessed': ' of LiPo (from the voltage)' + (
         f' or {iron} of LiFePO4' if iron > craft.cells else '')}.get(craft.cells_from, '')
-    return f'{counted(craft.cells, "cell")}{source}, ' + ('; or '.join(
+    # Without a comparison, the voltage alone does not tell a pack from a rail.
+    maybe = 'if it is a pack: ' if craft.cells_from == 'guessed' and not found else ''
+    return f'{maybe}{counted(craft.cells, "cell")}{source}, ' + ('; or '.join(
         f'class "{kind}": {"; ".join(words)}' for kind, words in found.items())
         or 'no class known to compare with')
 

@@ -101,7 +101,7 @@ def overview(recording: Recording, limit: float | None = None,
                     _largest(recording.current), _growth(recording, facts.noise.rms_v, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
-                    beware(recording))
+                    beware(recording, cells))
 
 
 def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:

@@ -13,8 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from ou_monitor.analysis.crafts import doubtful_cells, full_voltage
 from ou_monitor.criticism.adc import (
     EXAMINED, find_rails, find_step, innovation_std, step_words, usual_change)
+from ou_monitor.criticism.readings import why_stuck
+from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import (
     clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
 from ou_monitor.text import counted
@@ -27,8 +30,6 @@ _LIMITS = frozenset({Status.TOO_FEW_SAMPLES, Status.TOO_SHORT, Status.UNBOUND, S
                      Status.NO_RELAXATION})
 # Maximum scatter of the steps of an even clock: rms about the median, in medians.
 _UNEVEN = 0.05
-# Maximum voltage of a UAV supply, V; any supply in millivolts exceeds it.
-_MOST_VOLTS = 1000.0
 # Step, s, above which a wrong time unit is suspected (battery messages of autopilots come more
 # often); a lower one for recordings longer than _LONG_FLIGHT, s.
 _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
@@ -43,6 +44,8 @@ _BEWARE = {
         'sign.'),
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
     'TIME_UNIT': 'Beware: the time seems to be in a smaller unit.'}
+# Minimum readings of a constant voltage for a stuck sensor.
+_STUCK_READINGS = 10
 
 
 @dataclass(frozen=True)
@@ -88,15 +91,25 @@ def _fit_doubts(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     return items
 
 
-def beware(recording: Recording) -> tuple[str, ...]:
-    """Return the warnings that change the meaning of every number, for the first lines."""
-    return tuple(_BEWARE[item.name] for item in _unit_items(recording) if item.name in _BEWARE)
+def beware(recording: Recording, cells: int = 0) -> tuple[str, ...]:
+    """Return the warnings that change the meaning of every number (cells given; 0: none)."""
+    found = tuple(_BEWARE.get(item.name, f'Beware: {item.text[0].lower()}{item.text[1:]}')
+                  for item in faults(recording))
+    doubt = doubtful_cells(full_voltage(recording), cells) if cells else ''
+    return (*found, f'Beware: {doubt}') if doubt else found
+
+
+def faults(recording: Recording) -> list[QualityItem]:
+    """Return the faults of a whole recording after which no figure in V, or no rate, holds."""
+    stuck = why_stuck(recording.voltage) if recording.n >= _STUCK_READINGS else ''
+    return [*(item for item in _unit_items(recording) if item.name in _BEWARE),
+            *([QualityItem('STUCK', Severity.ERROR, stuck)] if stuck else [])]
 
 
 def _unit_items(recording: Recording) -> list[QualityItem]:
     items = []
     middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
-    if middle > _MOST_VOLTS:
+    if middle > MOST_SUPPLY:
         items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
             f'The median voltage is {middle:.4g}, too large for a UAV in volts: is it in mV, or '
             'in counts of an ADC? Alpha and tau are right, but all figures in V are in that unit, '

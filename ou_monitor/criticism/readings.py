@@ -258,8 +258,8 @@ def two_levels(v: FloatArray) -> str:
             '--throttle-column) would explain it; without one, it counts as noise and lines.')
 
 
-def why_no_model(v: FloatArray) -> str:
-    """Return why no model can be fitted to voltages, V; empty if one can."""
+def why_stuck(v: FloatArray) -> str:
+    """Return why the sensor seems to be stuck at one reading, V; empty if it does not."""
     if float(v.min()) == float(v.max()):
         return ('The voltage does not change at all: the sensor is stuck, or its step is larger '
                 'than the noise.')
@@ -268,6 +268,13 @@ def why_no_model(v: FloatArray) -> str:
     if odd <= max(_ODD, _ODD_SHARE * v.size):
         return (f'All but {odd} of its {v.size} samples read {_short(usual)} V: the sensor is '
                 'stuck, or its step is larger than the noise.')
+    return ''
+
+
+def why_no_model(v: FloatArray) -> str:
+    """Return why no model can be fitted to voltages, V; empty if one can."""
+    if stuck := why_stuck(v):
+        return stuck
     largest = float(np.abs(v).max())
     if largest > _LARGEST:
         return f'The voltage reaches {_short(largest)} V: no supply does; check its unit.'

@@ -12,6 +12,7 @@ from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.crafts import check_cells, full_voltage
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import Overview
+from ou_monitor.analysis.quality import faults
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.vehicles import start_of
 from ou_monitor.online.risk.first_passage import brownout_probability
@@ -65,6 +66,9 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
         throttle_topic=options.throttle_topic, columns=options.columns,
         partial=options.partial or is_csv(Path(path)))
     check_size(recording)
+    if found := faults(recording):
+        # Not compared with the others.
+        raise InputError(' '.join(item.text for item in found))
     if options.cells:
         check_cells(full_voltage(recording), options.cells)
     # Overflows give non-finite values, which the analysis reports in its status.

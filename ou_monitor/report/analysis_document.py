@@ -13,7 +13,7 @@ from ou_monitor.analysis.level_comparison import NARROW, sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.noise import BAND
 from ou_monitor.analysis.overview import answers, determined, known_lines
-from ou_monitor.analysis.quality import QualityItem
+from ou_monitor.analysis.quality import faults, QualityItem
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import DEFAULT_LIMIT
@@ -63,7 +63,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
 
 def answer(analysis: Analysis) -> list[str]:
     """Return the answer: doubts, lowest voltage, safe throttle, and sigma and tau if known."""
-    curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
+    curves = analysis.by_throttle
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
         f'At the end, safe up to {100.0 * curves.budget:.0f} % throttle for {curves.horizon:g} s'
@@ -72,8 +72,9 @@ def answer(analysis: Analysis) -> list[str]:
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
         f'{_why_no_throttle(analysis)}.']
     supply = [first, *safe, *others, *craft_advice(analysis.craft)]
-    # If the voltage has the wrong sign, only its noise has a meaning.
-    return [*analysis.overview.beware, *([] if 'VOLTAGE_SIGN' in names else supply),
+    # If the voltage has the wrong sign, only its noise has a meaning; a stuck sensor has none.
+    meaningless = {item.name for item in faults(analysis.recording)} & {'VOLTAGE_SIGN', 'STUCK'}
+    return [*analysis.overview.beware, *([] if meaningless else supply),
             *_numbers(analysis), *_change(analysis)]
 
 

@@ -5,7 +5,8 @@ import json
 
 import numpy as np
 from ou_monitor.analysis.crafts import (
-    _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, KNOWN, MICRO, QUAD,
+    _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, doubtful_cells,
+    KNOWN, MICRO, QUAD,
     ROBOT, stated_limit)
 from ou_monitor.analysis.overview import answers, overview
 from ou_monitor.analysis.supply import supply_facts
@@ -26,7 +27,8 @@ def flown(cells=4, sag=0.6, noise=0.08, source=None, n=1500):
 @pytest.mark.parametrize('volts, cells', [
     (4.2, 1), (3.6, 1), (8.4, 2), (11.1, 3), (12.6, 3), (16.8, 4), (15.2, 4), (17.4, 4),
     (22.59, 6), (25.2, 6), (39.1, 10), (49.0, 12), (0.0, 0), (NAN, 0),
-    (3.31, 0), (5.0, 0), (6.05, 0), (9.1, 0), (10.1, 0), (12.0, 3)])
+    (3.31, 0), (5.0, 0), (6.05, 0), (9.1, 0), (10.1, 0), (12.0, 3), (100.8, 24), (400.0, 0),
+    (16500.0, 0)])
 def test_cells_are_guessed_by_the_voltage(volts, cells):
     """Those nearest to 4 V that no charger overfills; most rails are no packs, but 12 V may be."""
     assert cell_count(volts) == cells
@@ -52,6 +54,24 @@ def test_cells_of_the_other_chemistry(volts, other):
     said = craft_line(craft_of(one, supply_facts(one)))
     assert 'of LiPo (from the voltage)' in said and ('LiFePO4' in said) == bool(other)
     assert other in said and 'LiPo' not in craft_line(craft_of(one, supply_facts(one), 6))
+
+
+def test_a_voltage_alone_does_not_make_a_pack():
+    """A rail of 24 V looks like six cells; no throttle, no comparison."""
+    rail = replace(flown(cells=6), throttle=None)
+    facts = supply_facts(rail)
+    assert craft_line(craft_of(rail, facts)).startswith('if it is a pack: 6 cells of LiPo')
+    assert craft_line(craft_of(rail, facts, 6)).startswith('6 cells, no class known')
+    assert craft_line(craft_of(replace(rail, voltage=1e3 * rail.voltage), facts)) == ''
+
+
+@pytest.mark.parametrize('full, cells, doubt', [
+    (16.6, 6, 'has 4 cells, not 6'), (16.6, 5, ''), (16.6, 4, ''), (18.1, 6, ''), (2.9, 1, ''),
+    (13.0, 5, 'has 3 cells, not 5'), (5.3, 2, '')])
+def test_a_count_that_hardly_fits_is_doubted(full, cells, doubt):
+    """Below 3 V per cell at rest, where fewer cells would have a usual voltage."""
+    found = doubtful_cells(full, cells)
+    assert doubt in found and bool(found) == bool(doubt)
 
 
 def test_values_are_called_usual_high_or_low():

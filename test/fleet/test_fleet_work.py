@@ -314,6 +314,17 @@ def test_cells_that_a_recording_cannot_have_are_an_error(tmp_path):
     assert 'it is likely 4 cells' in wrong['error'] and not wrong['levels']
 
 
+@pytest.mark.parametrize('factor, why', [(1e3, 'is it in mV'), (-1.0, 'negative'), (0.0, 'stuck')])
+def test_a_recording_whose_voltage_means_nothing_is_left_out(tmp_path, factor, why):
+    """It would head the report with 16000 V, and be compared with the others."""
+    path = tmp_path / 'pack.csv'
+    noise = np.random.default_rng(1).standard_normal(400)
+    path.write_text('time_s,voltage_v\n' + ''.join(
+        f'{0.01 * k:.2f},{factor * (16.0 + 0.05 * one):.4f}\n' for k, one in enumerate(noise)))
+    for cells in (0, 4):
+        assert why in work(str(path), Options(cells=cells))['error']
+
+
 @pytest.mark.parametrize('full, cells', [(13.6, 4), (13.2, 4), (5.1, 0)])
 def test_a_discharged_pack_has_the_cells_of_its_vehicle(full, cells):
     """Alone, 13.6 V fits no charged pack, and 13.2 V three cells; 5.1 V is another supply."""

@@ -27,6 +27,12 @@ def test_headline_warns_of_what_changes_its_own_numbers():
     swapped = answer(analyze(replace(simulated, voltage=-simulated.voltage)))
     assert swapped[0].startswith('Beware: the voltage is negative throughout')
     assert not any('fell' in one or 'safe' in one or 'sag' in one for one in swapped)
+    stuck = answer(analyze(replace(simulated, voltage=np.full(simulated.n, 5.0))))
+    assert stuck[0].startswith('Beware: the voltage does not change at all: the sensor is stuck')
+    assert not any('above' in one or 'sag' in one for one in stuck)
+    few = analyze(replace(simulated, voltage=16.6 / 5.0 * simulated.voltage), cells=6,
+                  brownout_voltage=19.8)
+    assert 'or it has 4 cells, not 6' in answer(few)[0]
     slow = replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
                    throttle=simulated.throttle[::20], current=None)
     found = analyze(slow)
