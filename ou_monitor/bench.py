@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import as_numbers, as_seconds, FloatArray, Recording
 from ou_monitor.report.result import Result
-from ou_monitor.text import counted
+from ou_monitor.text import counted, number
 from ou_monitor.timeline import check_size, ordered, readings_of, supplied
 
 if TYPE_CHECKING:
@@ -368,7 +368,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     Raises
     ------
     InputError
-        When the recording has no throttle, or its voltage does not fit the number of cells.
+        When the recording has neither throttle nor current, or its voltage does not fit the number
+        of cells.
     ValueError
         When a number is out of its range, or the recording does not show sag or noise.
 
@@ -380,6 +381,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     ('FOUND', True)
 
     """
+    from dataclasses import replace
     from ou_monitor.analysis.crafts import (
         cells_of, check_cells, full_voltage, pack_limit, stated_limit)
     from ou_monitor.analysis.quality import faults
@@ -409,6 +411,11 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         flown = supplied(readings_of(_read(recording)))
         if wrong := faults(flown):
             raise InputError(f'{flown.name}: {wrong[0].text}')
+        load = ''
+        if not flown.has_throttle and flown.current is not None and (
+                most := float(np.fmax.reduce(np.abs(flown.current), initial=0.0))) > 0.0:
+            flown = replace(flown, throttle=np.abs(flown.current) / most)
+            load = f' Throttle is the measured current over its largest, {number(most)} A.'
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells, origin = (values['cells'], 'given') if 'cells' in values else cells_of(flown)
         values['cells'] = cells
@@ -442,7 +449,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             level, source = default_voltage(0, circuit.regulator_voltage)
         assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
         share = circuit.battery_resistance / flight.resistance if flight.resistance > 0.0 else 1.0
-        taken = taken_words(flight, circuit, throttle, assumed, origin)
+        taken = taken_words(flight, circuit, throttle, assumed, origin) + load
         error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
             throttle, flight.throttle, flight.sag))
         if risk_of is not None and not values.keys() & SHOWN and facts.budget is not None and (
@@ -464,9 +471,10 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
     from ou_monitor.paper.design import Flight
 
     if not recording.has_throttle:
-        raise InputError(f'--from {recording.name}: the recording has no throttle, so sag and '
-                         'noise over throttle are unknown: name it with --throttle-column or '
-                         '--throttle-topic, or give --throttle and --set without --from')
+        raise InputError(f'--from {recording.name}: the recording has no throttle and no current, '
+                         'so sag and noise over throttle are unknown: name one '
+                         '(--throttle-column, --throttle-topic, --current-column), or give '
+                         '--throttle and --set without --from')
     monitor = None
     if level is not None:
         monitor, parts = node_for(recording, MonitorSettings(

@@ -5,9 +5,8 @@ import json
 
 import numpy as np
 from ou_monitor.analysis.crafts import (
-    _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, doubtful_cells,
-    KNOWN, MICRO, QUAD,
-    ROBOT, stated_limit)
+    _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, doubtful_cells, KNOWN,
+    MICRO, QUAD, ROBOT, stated_limit)
 from ou_monitor.analysis.overview import answers, overview
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.cli.main import main

@@ -245,6 +245,23 @@ def test_a_recorded_rail_is_the_source(volts, level, said, tmp_path, capsys):
     assert 'taken as a rail' in found['measured'] and 'packs' not in str(found)
 
 
+def test_a_measured_current_is_the_load(tmp_path, capsys):
+    """A rail of 0.1 Ohm without a throttle: the answer is that of the current as throttle."""
+    rng = np.random.default_rng(2)
+    amps = np.repeat(2.0 * rng.uniform(0.0, 1.0, 80), 50)
+    path = tmp_path / 'rail.csv'
+    path.write_text('time_s,voltage_v,current_a\n' + ''.join(
+        f'{k / 50.0:.2f},{5.0 - 0.1 * one + 0.003 * noise:.5f},{one:.4f}\n'
+        for k, (one, noise) in enumerate(zip(amps, rng.standard_normal(amps.size)))))
+    found = asked(capsys, '--from', path)
+    assert f'current over its largest, {amps.max():.3g} A' in found['measured']
+    assert found['network']['battery_resistance'] == pytest.approx(0.1, rel=0.1)
+    assert found['present']['sag'] == pytest.approx(
+        0.1 * amps.max() * found['throttle'], rel=0.1)
+    assert main(['design', '--from', str(path), '--current-column', 'none']) == 2
+    assert 'no throttle and no current' in capsys.readouterr().err
+
+
 def test_the_sag_of_a_small_pack_is_the_recorded_one(tmp_path, capsys):
     """The current of its regulator is in the recording, and full throttle has noise too."""
     rng = np.random.default_rng(4)
