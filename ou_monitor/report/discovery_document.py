@@ -11,8 +11,10 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.words import (
-    by_load, cause_rows, curve_text, GAIN, gain_text, overlap_words, parameters, plain_words,
-    with_error)
+    both_names, by_load, cause_rows, curve_text, GAIN, gain_text, overlap_words, parameters,
+    plain_words, with_error)
+from ou_monitor.model.terms.regime_switching import RegimeSwitching
+from ou_monitor.model.terms.term import Role
 from ou_monitor.records import NAN
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Part, Section, Table, Text)
@@ -147,8 +149,15 @@ def _disagreement(finding: Finding, seen: Overview | None) -> str:
     if supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
             Z95 * math.hypot(supply.log_se('alpha'), se / alpha)):
         return ''
+    # The fit under Relaxation removes load, its lags and lines, but no other process with memory.
+    inside = dict.fromkeys(
+        both_names(term.NAME) for term, se in zip(finding.model.terms, finding.se)
+        if term.ROLE is Role.BLOCK or (term.NAME == RegimeSwitching.NAME and abs(
+            term.values()['level']) > Z95 * se['level']))
     return (f' Its alpha disagrees with the one under Relaxation ({number(supply.alpha)} 1/s, '
             f'from the last {number(supply.window_s)} s): ' + (
+                f'that value also contains {" and ".join(inside)}, which the model separates.'
+                if inside else
                 'the model also fits errors of its response to load: prefer the latter value.'
                 if finding.remaining else
                 'no statistic contradicts the model, so the relaxation seems to change.'))
