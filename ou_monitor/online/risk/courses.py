@@ -137,8 +137,8 @@ def mean_now(state: LoadState) -> float:
 
 
 def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Sampling
-           ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and deviation, V, of the lowest voltage of each course, shape (k,)."""
+           ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mean of the lowest voltage of each course, its noise, its error, V; (k,)."""
     peak, dt = courses.peak, sampling.interval
     span = max(horizon, dt)
     stay = np.clip(courses.dwell, dt, span)
@@ -165,8 +165,12 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     apart = np.maximum(means - mean[:, None], 0.0) / sd[:, None]
     ln_n = np.log(np.maximum((count * np.exp(-largest[:, None] * apart)).sum(axis=1), 1.0))
     known = np.maximum(((row @ state.covariance) * row).sum(axis=1), 0.0)
-    return (mean - sd * np.interp(ln_n, _LN_N, _MEAN),
-            np.sqrt(known + (sd * np.interp(ln_n, _LN_N, _DEVIATION)) ** 2))
+    # The throttle of a peak is only known within `AT_PEAK`, which counts as noise.
+    c = state.size * state.mean
+    slope = (c[2] + c[5:5 + len(LAGS)].sum()) * POWER * peak ** (POWER - 1.0) + (
+        c[3] + c[5 + len(LAGS):-1].sum()) + 3.0 * c[4] * peak ** 2
+    noise = np.hypot(sd * np.interp(ln_n, _LN_N, _DEVIATION), 0.5 * AT_PEAK * slope)
+    return mean - sd * np.interp(ln_n, _LN_N, _MEAN), noise, np.sqrt(known)
 
 
 # Length of a block, s; time that is kept, s; maximum silence that is filled, s.

@@ -7,8 +7,8 @@ used alone if the load is unknown).  First passage and the other method are aver
 the share of completed horizons whose lowest voltage contradicts first passage.
 
 Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu - start) + e, with
-mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's t
-distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2.
+mean mu, noise s and error r of `lowest`, by least squares with forgetting; e has Student's t
+distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2 + r^2.
 
 Each law is mixed with a wider one, whose weight is the share of horizons that contradict the law
 (rule of succession).  A horizon counts with the probability that the law was wrong in it, and with
@@ -103,21 +103,21 @@ class LowestLaw:
     def __init__(self, values: FloatArray) -> None:
         self.values = values
 
-    def moments(self, mean: FloatArray, deviation: FloatArray, start: float
+    def moments(self, mean: FloatArray, noise: FloatArray, error: FloatArray, start: float
                 ) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation, V, of the lowest voltage, errors of the law included."""
-        bias, gain, noise, fall, c00, c01, c11 = self.values.tolist()
+        bias, gain, k0, k1, c00, c01, c11 = self.values.tolist()
         x = mean - start
-        return start + bias * deviation + gain * x, np.sqrt(
-            (noise + c00) * deviation * deviation + 2.0 * c01 * deviation * x
-            + (fall + c11) * x * x)
+        return start + bias * noise + gain * x, np.sqrt(
+            (k0 + c00) * noise * noise + 2.0 * c01 * noise * x + (k1 + c11) * x * x
+            + error * error)
 
 
 class Calibrator:
     """Learns a `LowestLaw` from completed horizons."""
 
     def __init__(self) -> None:
-        # Regression on deviation and predicted fall: sums of their products, and with the fall.
+        # Regression on noise and predicted fall: sums of their products, and with the fall.
         self._information: tuple[float, ...] = _PRECISION
         self._weighted: tuple[float, ...] = _PRECISION[1:]
         # For each variance: effective number of horizons, and sum of the variances they imply.
@@ -133,14 +133,14 @@ class Calibrator:
         self.law = LowestLaw(np.array([*self._b, *self._variance, b / whole, -both / whole,
                                        a / whole]))
 
-    def add(self, low: float, mean: float, deviation: float, start: float, weight: float,
-            elapsed: float) -> None:
-        """Learn from a completed horizon: lowest, predicted and first voltage, V."""
+    def add(self, low: float, mean: float, noise: float, error: float, start: float,
+            weight: float, elapsed: float) -> None:
+        """Learn from a completed horizon: lowest, predicted (see `lowest`) and first voltage, V."""
         keep = math.exp(-elapsed / MEMORY)
         x, y = mean - start, low - start
-        miss = y - self._b[0] * deviation - self._b[1] * x
-        parts = self._variance * np.array([deviation * deviation, x * x])
-        total = float(parts.sum())
+        miss = y - self._b[0] * noise - self._b[1] * x
+        parts = self._variance * np.array([noise * noise, x * x])
+        total = float(parts.sum()) + error * error
         least = weight / total * min(1.0, _HUBER * math.sqrt(total) / max(abs(miss), 1e-9))
         # Each variance learns in proportion to its share of the total (score equations).
         share = weight * parts / total
@@ -150,10 +150,10 @@ class Calibrator:
         self._information = tuple(
             prior + (old - prior) * keep + least * one
             for prior, old, one in zip(_PRECISION, self._information, (
-                deviation * deviation, deviation * x, x * x)))
+                noise * noise, noise * x, x * x)))
         self._weighted = tuple(
             prior + (old - prior) * keep + least * y * one
-            for prior, old, one in zip(_PRECISION[1:], self._weighted, (deviation, x)))
+            for prior, old, one in zip(_PRECISION[1:], self._weighted, (noise, x)))
         self._settle()
 
 
@@ -264,16 +264,16 @@ class _HorizonLaws:
         if begun.state is not None and begun.courses is not None and math.isfinite(peak):
             start, law = mean_now(begun.state), self.calibrator.law
             courses, shares = begun.courses
-            mean, deviation = lowest(
+            parts = lowest(
                 begun.state, courses.after(held(peak, dwell, begun.state.throttle)), self.horizon,
                 sampling)
-            middle, spread = law.moments(mean, deviation, start)
+            middle, spread = law.moments(*parts, start)
             found = density(y, middle, spread)
             wide = density(y, middle[:1], _wider(spread[:1], begun.deviation, self.held.misses))
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
                           max(float(middle[0] - low), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
-            self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
+            self.calibrator.add(low, *(part.item(0) for part in parts), start, weight, elapsed)
         if begun.passage is not None:
             self.passage.add(begun.passage.density(low, self.horizon), other, weight, elapsed)
 

@@ -424,3 +424,22 @@ def test_idling_is_not_charged_with_the_punches_of_the_flight():
     assert max(risks) < 0.001
     # A punch, which the flight has shown, is not safe.
     assert monitor.risk_if(0.9, 0.5, 14.5, 2.0) > 0.5
+
+
+def test_gusts_do_not_hide_the_fall_of_a_throttle_that_is_held():
+    """
+    A hover in gusts, then 70 % for 2 s: likely 0.3 V above the true lowest, unlikely 0.1 V below.
+
+    Throttle within 5 % of the highest counts as its peak, so falls come out too deep by a few per
+    cent of throttle.  When the law could only take that for its gain, the risk was 0.35 to 0.95.
+    """
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 300.0, 0.02)
+        gust = np.interp(t, 0.3 * np.arange(1001), rng.standard_normal(1001))
+        u = np.clip(0.45 + 0.06 * gust + 0.03 * rng.standard_normal(t.size), 0.0, 1.0)
+        monitor = SupplyMonitor(MonitorSettings(brownout_voltage=12.0))
+        monitor.push(t, 15.0 - 3.0 * u ** 1.8 + 0.02 * rng.standard_normal(t.size), u)
+        low = 15.0 - 3.0 * 0.7 ** 1.8 - 0.03
+        above, below = (monitor.risk_if(0.7, 2.0, low + by, 2.0) for by in (0.3, -0.1))
+        assert above > 0.9 and below < 0.1
