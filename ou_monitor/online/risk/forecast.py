@@ -135,7 +135,7 @@ class Calibrator:
 
     def add(self, low: float, mean: float, noise: float, error: float, start: float,
             weight: float, elapsed: float) -> None:
-        """Learn from a completed horizon: lowest, predicted (see `lowest`) and first voltage, V."""
+        """Learn from a completed horizon: lowest, predicted (see `lowest`) and start, V."""
         keep = math.exp(-elapsed / MEMORY)
         x, y = mean - start, low - start
         miss = y - self._b[0] * noise - self._b[1] * x
