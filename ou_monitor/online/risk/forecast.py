@@ -273,7 +273,8 @@ class _HorizonLaws:
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
                           max(float(middle[0] - low), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
-            self.calibrator.add(low, *(part.item(0) for part in parts), start, weight, elapsed)
+            mean, noise, error = (part.item(0) for part in parts)
+            self.calibrator.add(low, mean, noise, error, start, weight, elapsed)
         if begun.passage is not None:
             self.passage.add(begun.passage.density(low, self.horizon), other, weight, elapsed)
 
