@@ -35,7 +35,7 @@ _STEADY, _STEADY_TIME = 0.02, 0.2
 _WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
-# Minimum time of these readings, s, and its maximum as a share of the recording.
+# Minimum time of these readings, s, or share of the recording, whichever is shorter.
 _IN_TIME, _IN_SHARE = 0.5, 0.02
 
 

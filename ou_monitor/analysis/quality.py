@@ -100,7 +100,7 @@ def beware(recording: Recording, cells: int = 0) -> tuple[str, ...]:
 
 
 def faults(recording: Recording) -> list[QualityItem]:
-    """Return the faults of a whole recording after which no figure in V, or no rate, holds."""
+    """Return the faults of a whole recording that make figures in V, or rates, meaningless."""
     stuck = why_stuck(recording.voltage) if recording.n >= _STUCK_READINGS else ''
     return [*(item for item in _unit_items(recording) if item.name in _BEWARE),
             *([QualityItem('STUCK', Severity.ERROR, stuck)] if stuck else [])]
@@ -112,7 +112,7 @@ def _unit_items(recording: Recording) -> list[QualityItem]:
     if middle > MOST_SUPPLY:
         items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
             f'The median voltage is {middle:.4g}, too large for a UAV in volts: is it in mV, or '
-            'in counts of an ADC? Alpha and tau are right, but all figures in V are in that unit, '
+            'in counts of an ADC? Alpha and tau are right, but figures marked V have that unit, '
             'and no risk is computed. Use --unit mV for a CSV, unit_factor in a msg config for a '
             'bag.')))
     if recording.n and float(recording.voltage.max()) < 0.0:

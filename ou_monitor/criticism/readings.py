@@ -124,15 +124,15 @@ def _part(v: FloatArray) -> slice:
 
 def _on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str]
              ) -> tuple[FloatArray, float]:
-    """Return a load as early as the voltage answers it, and its sign; note by how much."""
+    """Return a load with late stamps corrected, and its sign; note the correction."""
     # A voltage cannot precede its load, so the stamps of such a load are late; a voltage that
     # follows late is the cause `load_transient`.
     some = _part(v)
     late, sign = timing(t[some], v[some], load[some])
     if not late > 0.0 or (name == 'throttle' and sign < 0.0):
         return load, sign
-    notes.append(f'The voltage answers {number(1e3 * late)} ms before the {name} shows it: the '
-                 f'{name} was taken that much earlier.')
+    notes.append(f'The voltage responds {number(1e3 * late)} ms before the {name}: the stamps of '
+                 f'the {name} are late, and were corrected.')
     return np.asarray(np.interp(t + late, t, load)), sign
 
 

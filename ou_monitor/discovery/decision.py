@@ -30,11 +30,10 @@ TIE = 3.0
 # of that effect (FORM: a response of the mean, CURVE: a second curve of intensity over throttle).
 # A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
 # (test/hidden), further terms gained at most 0.8 % if the form was right.
-FORM = 0.005
+FORM, CURVE = 0.005, 0.1
 # Evidence per sample that is enough for a correction of a form in any case, nats: one-step errors
 # shrink by 2 %.  An unmodelled lag of that size biases alpha, or imitates a latent cause.
 VISIBLE = 0.02
-CURVE = 0.1
 # Minimum number of relaxation times in a recording; with fewer, the OU counts as a trend.  At this
 # limit, the relative error of its rate is sqrt(2/20) = 30 %.
 RELAXES = 20.0

@@ -207,7 +207,7 @@ class Fitter:
         return last[1]
 
     def _finds_events(self, kind: type[Term], view: View) -> bool:
-        """Return whether a law finds events; without it, they inflate the fitted variances."""
+        """Return whether a law finds events, which inflate the variances of fits without it."""
         found = None if kind.SLOW_FIT else self.law_fit(kind, view)
         return found is not None and (found.push is not None or found.error is not None)
 

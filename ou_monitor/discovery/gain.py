@@ -249,7 +249,7 @@ def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: Floa
 
 
 def covered(samples: Samples) -> npt.NDArray[np.bool_]:
-    """Return which samples are at throttle of other blocks, and not soon after other throttle."""
+    """Return where throttle, now and for `_AFTER` before, is in the range of other blocks."""
     found = np.ones(samples.n, dtype=np.bool_)
     u = samples.throttle
     if u is None:

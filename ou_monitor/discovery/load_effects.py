@@ -23,8 +23,8 @@ _DIGITS = (4, 6)
 _DRAWS = 8
 # Quantiles of the load between which a fall is measured.
 _FLOWN = (0.01, 0.99)
-# Maximum time between a dip and its predicted minimum, s; the load has caused the dip if the
-# prediction has more than this share of its depth.
+# Maximum time between a dip and its predicted minimum, s; minimum share of its depth that is
+# predicted from the load if the load caused it.
 _NEAR, _MADE = 0.05, 0.5
 
 

@@ -166,7 +166,7 @@ def _path_within(low: FloatArray, cell: float, noise: FloatArray, phi: FloatArra
     least = np.maximum(noise, _LEAST * cell)[:, None]
     edge = (places * move[:, None] - low[:, None]) / least
     likely = np.maximum(ndtr(edge) - ndtr(edge - cell / least), _NONE)
-    # The grid is in moves of the sample; for the first, in stationary standard deviations.
+    # Each sample's grid is in units of `move`; the first `move` is the stationary deviation.
     keep = phi[1:] * move[:-1] / move[1:]
     known = likely
     known[0] *= np.exp(-0.5 * np.square(places[0]))

@@ -182,7 +182,7 @@ class _Regression:
         for k in start:
             chosen = self._with_term(chosen, k)
         chosen = self._moved(chosen)
-        # So far, a better time constant may stand beside the one that it replaces.
+        # So far the set may contain both a time constant and its replacement.
         self._apart = True
         while self._has_twins(chosen):
             chosen = max((self._less(chosen, k) for k in chosen),
@@ -213,7 +213,7 @@ class _Regression:
     def exchanged(self, own: int, places: Sequence[int]
                   ) -> tuple[tuple[int, ...], tuple[float, ...]]:
         """Replace any of the first `own` terms by a better later one; return terms and worth."""
-        # places: for each later term, the one of the first that it may replace.
+        # places: for each later term, the index of the term that it may replace.
         self._apart = True
         chosen = list(range(own))
         for k, place in enumerate(places, own):

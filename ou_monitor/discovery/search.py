@@ -371,10 +371,10 @@ def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Compos
 
 
 def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Composite:
-    """Return a model with the noise terms, under load, that have evidence."""
-    # on_sigma: whether sigma may follow the law of the white noise.  Not before the response to
-    # throttle is chosen, because noise with memory imitates a response, and not if simulations
-    # would leave the recorded range: one-step predictions hardly constrain that.
+    """Return a model with the noise terms that have evidence."""
+    # on_sigma: whether sigma may follow the law of the white noise.  It may not before the
+    # response to throttle is chosen, because noise with memory imitates a response, nor if
+    # simulations leave the recorded range: one-step predictions hardly constrain that.
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)

@@ -258,8 +258,8 @@ def overlap_words(causes: Sequence[Cause], gain: float) -> str:
     if not larger:
         return ''
     return (f'Without {" or without ".join(larger)} the rest of the model predicts worse than the '
-            'plain OU, so that gain exceeds the gain of the whole model: single gains overlap and '
-            'do not add up.')
+            'plain OU. The gain of a cause can thus exceed the gain of the whole model: gains '
+            'overlap and do not add up.')
 
 
 def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
@@ -367,7 +367,7 @@ PLAIN_NAMES = {
     'load_transient': 'a response to changes of throttle',
     'lopsided_noise': 'noise with falls deeper than its rises',
     'measurement_noise': 'noise of the sensor',
-    'nonlinear_restoring': 'a load of constant power',
+    'nonlinear_restoring': 'a nonlinear restoring force',
     'quantization': 'a coarse ADC',
     'regime_switching': 'two states of the supply',
     'resonance': 'ringing of leads and capacitors',

@@ -64,7 +64,7 @@ def test_a_current_is_taken_with_its_sign_and_its_delay(sign, late):
                           flown(4), notes)
     assert full == pytest.approx(sign * 30.0 * np.quantile(load, 0.99))
     assert np.corrcoef(found[10:-10], load[10:-10])[0, 1] > 0.99
-    assert len(notes) == 1 + bool(late) and (not late or 'answers 50.0 ms before' in notes[1])
+    assert len(notes) == 1 + bool(late) and (not late or 'responds 50.0 ms before' in notes[1])
 
 
 def test_throttle_stays_the_load_where_current_is_noise_or_unknown():
@@ -86,7 +86,7 @@ def test_a_throttle_that_was_stamped_late_is_taken_earlier(late):
     notes = []
     found, _ = load_of(Recording(T, v, np.roll(load, late), ''), T, v, np.roll(load, late), notes)
     np.testing.assert_allclose(found[10:-10], load[10:-10], rtol=0, atol=1e-9)
-    assert f'answers {late * 10:.1f} ms before the throttle' in notes[0]
+    assert f'responds {late * 10:.1f} ms before the throttle' in notes[0]
 
 
 def test_a_delay_between_samples_is_found():
