@@ -165,11 +165,11 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     apart = np.maximum(means - mean[:, None], 0.0) / sd[:, None]
     ln_n = np.log(np.maximum((count * np.exp(-largest[:, None] * apart)).sum(axis=1), 1.0))
     known = np.maximum(((row @ state.covariance) * row).sum(axis=1), 0.0)
-    # The throttle of a peak is only known within `AT_PEAK`, which counts as noise.
+    # The throttle of a peak is evenly distributed within `AT_PEAK`, which counts as noise.
     c = state.size * state.mean
     slope = (c[2] + c[5:5 + len(LAGS)].sum()) * POWER * peak ** (POWER - 1.0) + (
         c[3] + c[5 + len(LAGS):-1].sum()) + 3.0 * c[4] * peak ** 2
-    noise = np.hypot(sd * np.interp(ln_n, _LN_N, _DEVIATION), 0.5 * AT_PEAK * slope)
+    noise = np.hypot(sd * np.interp(ln_n, _LN_N, _DEVIATION), AT_PEAK / math.sqrt(12.0) * slope)
     return mean - sd * np.interp(ln_n, _LN_N, _MEAN), noise, np.sqrt(known)
 
 

@@ -8,7 +8,7 @@ the share of completed horizons whose lowest voltage contradicts first passage.
 
 Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu - start) + e, with
 mean mu, noise s and error r of `lowest`, by least squares with forgetting; e has Student's t
-distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2 + r^2.
+distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2 + k2 r^2.
 
 Each law is mixed with a wider one, whose weight is the share of horizons that contradict the law
 (rule of succession).  A horizon counts with the probability that the law was wrong in it, and with
@@ -54,9 +54,9 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
 # Prior of the law: weight of the variances, in horizons; variances k0 and k1 (on nine recorded
-# flights, from gecko to cf_takeoff, 1 to 6 and 0.015 to 0.09); precision matrix of bias and gain
-# (elements 00, 01, 11).
-_PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03])
+# flights, from gecko to cf_takeoff, 1 to 6 and 0.015 to 0.09), and k2, as the load filter states
+# its error; precision matrix of bias and gain (elements 00, 01, 11).
+_PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03, 1.0])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
 # Memory, s; limit of squared standardised errors; standardised error beyond which errors weigh
 # less in the regression.
@@ -98,7 +98,7 @@ def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) ->
 
 
 class LowestLaw:
-    """`values`: bias b0, gain b1, variances k0 and k1, and covariance of b0 and b1 (3 values)."""
+    """`values`: bias b0, gain b1, variances k0 to k2, and covariance of b0 and b1 (3 values)."""
 
     def __init__(self, values: FloatArray) -> None:
         self.values = values
@@ -106,11 +106,11 @@ class LowestLaw:
     def moments(self, mean: FloatArray, noise: FloatArray, error: FloatArray, start: float
                 ) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation, V, of the lowest voltage, errors of the law included."""
-        bias, gain, k0, k1, c00, c01, c11 = self.values.tolist()
+        bias, gain, k0, k1, k2, c00, c01, c11 = self.values.tolist()
         x = mean - start
         return start + bias * noise + gain * x, np.sqrt(
             (k0 + c00) * noise * noise + 2.0 * c01 * noise * x + (k1 + c11) * x * x
-            + error * error)
+            + k2 * error * error)
 
 
 class Calibrator:
@@ -121,7 +121,7 @@ class Calibrator:
         self._information: tuple[float, ...] = _PRECISION
         self._weighted: tuple[float, ...] = _PRECISION[1:]
         # For each variance: effective number of horizons, and sum of the variances they imply.
-        self._count, self._squares = np.zeros(2), np.zeros(2)
+        self._count, self._squares = np.zeros(3), np.zeros(3)
         self._settle()
 
     def _settle(self) -> None:
@@ -139,8 +139,8 @@ class Calibrator:
         keep = math.exp(-elapsed / MEMORY)
         x, y = mean - start, low - start
         miss = y - self._b[0] * noise - self._b[1] * x
-        parts = self._variance * np.array([noise * noise, x * x])
-        total = float(parts.sum()) + error * error
+        parts = self._variance * np.array([noise * noise, x * x, error * error])
+        total = float(parts.sum())
         least = weight / total * min(1.0, _HUBER * math.sqrt(total) / max(abs(miss), 1e-9))
         # Each variance learns in proportion to its share of the total (score equations).
         share = weight * parts / total
@@ -441,7 +441,7 @@ class Forecast:
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
-            self._laws[horizon] = (LowestLaw(values[:7]), *values[7:].tolist())
+            self._laws[horizon] = (LowestLaw(values[:8]), *values[8:].tolist())
         return self._laws[horizon]
 
     def risk(self, voltage: float, horizon: float) -> Outcome:
