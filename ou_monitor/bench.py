@@ -342,8 +342,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         Flight that gives level, sag, resistance and noise.
     network : mapping, optional
         Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``. A resistance
-        or voltage that the recording shows is changed to the value given; components that it does
-        not show are those of the recorded craft.
+        or voltage that the recording shows is changed to the value given; other components are
+        taken for those of the recorded craft.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional

@@ -17,7 +17,8 @@ the live risk at the end of the flight, which also gives the throttle budget of 
 other components, the sag is scaled with the resistance, and the noise with the noise of the
 network. A given resistance or battery voltage changes the risk as a row of the table does: the
 current remains that of the recorded resistance. A component that the recording does not show (the
-capacitor, or the resistance without a measured current) is that of the recorded craft. The risks
+capacitor, or the resistance without a measured current) counts as that of the recorded craft,
+whether it is given or the default. The risks
 include the errors of sag and level and what throttle did not explain. Limits: sag and noise are as
 measured, including the white noise and the filter of the sensor. Noise added by changes of
 throttle, and an OU if one was found, count as slow fluctuations of the current, which capacitors

@@ -195,14 +195,23 @@ def test_set_values_override_the_flight(flight, capsys):
     assert 'it is likely 4' in capsys.readouterr().err
 
 
+def rail(tmp_path, volts, sag, rms, amperes=None):
+    """Write 40 s of a rail, V, that falls by `sag` at full throttle, with a current if given."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(0.0, 1.0, 80), 50)
+    v = volts - sag * u + rms * rng.standard_normal(u.size)
+    columns = {'time_s': np.arange(u.size) / 100.0, 'voltage_v': v, 'throttle': u}
+    if amperes is not None:
+        columns['current_a'] = amperes * u
+    path = tmp_path / 'rail.csv'
+    np.savetxt(path, np.column_stack(list(columns.values())), '%.5f', ',', comments='',
+               header=','.join(columns))
+    return path
+
+
 def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
     """Of 5 V, which falls by 60 mV at full throttle; a number of cells is refused."""
-    rng = np.random.default_rng(2)
-    u = np.repeat(rng.uniform(0.0, 1.0, 40), 100)
-    path = tmp_path / 'rail.csv'
-    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
-        f'{k / 100.0:.2f},{5.02 - 0.06 * one + 0.009 * noise:.5f},{one:.3f}\n'
-        for k, (one, noise) in enumerate(zip(u, rng.standard_normal(u.size)))))
+    path = rail(tmp_path, 5.02, 0.06, 0.009)
     assert asked(capsys, '--from', path)['brownout_voltage'] == 4.5
     found = asked(capsys, '--from', path, '--rail', 'regulated', '--brownout-voltage', '4.9')
     assert found['present']['mean'] == pytest.approx(5.02 - 0.06 * found['throttle'], abs=0.005)
@@ -218,12 +227,7 @@ def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
     (12.0, 9.9, '3 cells guessed from the voltage: --cells N for others, --set cells=0 with')])
 def test_a_recorded_rail_is_the_source(volts, level, said, tmp_path, capsys):
     """A regulator of 0.1 Ohm, up to 2 A: mean = level - R I, and one pole, 1 / ((R + ESR) C)."""
-    rng = np.random.default_rng(2)
-    u = np.repeat(rng.uniform(0.0, 1.0, 80), 50)
-    path = tmp_path / 'rail.csv'
-    path.write_text('time_s,voltage_v,throttle,current_a\n' + ''.join(
-        f'{k / 50.0:.2f},{volts - 0.2 * one + 0.003 * noise:.5f},{one:.3f},{2.0 * one:.4f}\n'
-        for k, (one, noise) in enumerate(zip(u, rng.standard_normal(u.size)))))
+    path = rail(tmp_path, volts, 0.2, 0.003, amperes=2.0)
     found = asked(capsys, '--from', path)
     assert found['brownout_voltage'] == pytest.approx(level)
     assert said in found['brownout_voltage_source']

@@ -1,5 +1,5 @@
 """
-Group samples into blocks, and learn the delay of throttle and the noise from them.
+Group samples into blocks; learn the delay of throttle, changes of the response, and noise.
 
 A block has one throttle; there are at most about 50 blocks a second.  Limits: an incomplete block
 is not returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms
@@ -228,7 +228,7 @@ class LoadDelay:
 # The response has changed if the voltage at rest and the load correlate by more than this in two
 # successive segments of `_PIECE`, of at least this number of blocks.  With 0.8, none of 22
 # recordings changed (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and others),
-# and a sag of 20 times the noise is noticed within 4 s.
+# and simulated sags of 20 to 200 times the noise are noticed within 6 s.
 _CHANGED, _BLOCKS = 0.8, 20
 
 
