@@ -76,7 +76,7 @@ class AlphaTest:
         if self.levels < 2:
             return ('This recording cannot decide whether alpha depends on load: '
                     f'{"only one" if self.levels else "no"} throttle held long enough has '
-                    f'a usable fit{" that one OU describes" if self.withheld else ""}.')
+                    f'a usable fit{" and is described by one OU" if self.withheld else ""}.')
         least, ends = _factor(self.detectable_ratio), 'from the lowest to the highest throttle'
         if self.verdict == 'differs':
             size = 'by a factor that is not determined' if math.isnan(self.ratio) else (

@@ -174,9 +174,9 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
         return _plain(ProcessType.STATIONARY, 'the innovations show a second relaxation, '
                       'slower or faster than the fitted one, so alpha is a mixture',
                       f'{_share(second.effect)}, {_p(second)}; {normal}')
-    beside = f'; beside lines of {percent(line_share)} of the variance' if line_share else ''
+    lines = f'; lines carry {percent(line_share)} of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
-                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')
+                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{lines}')
 
 
 def _share(share: float) -> str:

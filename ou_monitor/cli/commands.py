@@ -23,7 +23,7 @@ class Option:
 
 
 class OptionalOut(argparse.Action):
-    """A flag that makes OUT optional (an always optional OUT could not follow an option)."""
+    """A flag that makes OUT optional (with nargs='?', OUT could not follow an option)."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
@@ -64,7 +64,7 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
 # Upper limit of a quantity, so that products stay finite.
 _QUANTITY_MOST = 1e15
-# Upper limits of components of a craft, with a margin; a larger number lacks its prefix.
+# Upper limits of components, with a margin; if a number is larger, its prefix was forgotten.
 _PART_MOST = {'F': 10.0, 'H': 1.0, 'Ohm': 100.0}
 _QUANTITY = re.compile(r'([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?', re.ASCII)

@@ -317,7 +317,6 @@ def summary(answer: Sequence[str], **files: object) -> None:
     made = {name: path for name, path in files.items()
             if path is not None and str(path) != STDOUT}
     if len(made) > 1:
-        # Name the JSON file only if there is no other.
         made.pop('json', None)
     last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
     say('\n' + '\n'.join([*map(paragraph, answer[:2]), last or paragraph(_NO_FILE)]))

@@ -330,7 +330,7 @@ class Difference:
 
 def band(measured: float, simulated: FloatArray) -> Band:
     """Return a number of the recording with the band of the simulations, shape (seeds,)."""
-    # 95 % of further simulations lie within these (91 % by NumPy's default method, from 50).
+    # 95 % of further simulations lie in low..high (of 50, NumPy's default method gives 91 %).
     low, median, high = np.percentile(simulated, [_LOW, 50.0, _HIGH], method='weibull').tolist()
     return Band(measured, low, median, high)
 

@@ -146,7 +146,7 @@ class Finding:
     # Mean log predictive density of held-out blocks, nats per sample.
     baseline_score: float = NAN
     criticism: tuple[Criticism, ...] = ()  # All statistics
-    causes: tuple[Cause, ...] = ()  # As accepted
+    causes: tuple[Cause, ...] = ()  # In order of acceptance
     model: SupplyModel | None = None  # The extended model, fitted to everything
     se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, one dict per term
     # Score of the extended model, its gain, and the gain's standard error, nats per sample.
@@ -164,8 +164,8 @@ class Finding:
     simulated: SupplyModel | None = None
     refused: str = ''  # Why the extended model is refused, in words; otherwise empty
     full: float = NAN  # Current at which the load is 1, A; NaN if current is not the load
-    has_throttle: bool = True  # Whether the recording has throttle
-    seed: int = 0  # Random seed
+    has_throttle: bool = True
+    seed: int = 0
 
     @property
     def sentence(self) -> str:

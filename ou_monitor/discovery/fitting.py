@@ -179,7 +179,7 @@ class Fitter:
         found, names = list(known), {trial.name for trial in known}
         best = sorted(estimates, key=lambda estimate: -estimate[0])[:_FEW]
         for gain, kind, start in best:
-            # In a full fit, a law may lose all of its estimated gain, so only full fits compare.
+            # A full fit of a law may gain nothing, so compare the estimates with full fits only.
             top = max((trial.evidence for trial in found), default=0.0)
             if gain < _WITHIN * top or kind.NAME in names:
                 continue

@@ -136,7 +136,7 @@ def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:
 
 def _extrapolated(samples: Samples, state: Pruned, k: int) -> bool:
     """Return whether held-out blocks cannot judge a response that the fit shows."""
-    # Without one block of a staircase, load and time must both be extrapolated.
+    # If the load follows time, predicting a left-out block extrapolates both load and time.
     return (state.worth[k].chance <= decision.CHANCE
             and decision.is_response(catalogue()[state.names[k]]) and follows_time(samples) > 0.0)
 

@@ -156,7 +156,6 @@ def run_fleet(found: SearchResult, folder: Path, options: Options, version: Call
 
 def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]],
           saved: SavedResults, options: Options, pool: Workers, progress: Progress | None) -> None:
-    """Analyse unfinished recordings, and save each result."""
     kept = len(results)
     # The largest first, so that no long one is left at the end.
     order = sorted(missing, key=lambda source: (-source.size, source.path))

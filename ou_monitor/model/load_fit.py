@@ -133,7 +133,7 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
 
     def fit(order: int, *shifts: int) -> tuple[float, float]:
         """Return squared residuals of differences of an order, and the product with the load."""
-        # The load is the mean of the load at some shifts.
+        # X: the mean of the load over the shifts.
         X = np.diff(np.mean([[np.interp(t + shift * unit, t, row) for row in loads]
                              for shift in shifts], axis=0), order)
         y = np.diff(left, order)
@@ -152,8 +152,8 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     # A best shift at the end of the range is not a minimum.
     inside = abs(best) < max(found)
     best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
-    # Half a sample beside a steep change of the load leaves errors that look like glitches.  The
-    # interpolation of a noisy load averages it, but averaging in both directions does as well.
+    # A delay wrong by half a sample leaves glitch-like errors at steep changes of the load.  But a
+    # fine shift also smooths a noisy load, so it must beat a mean of both shifts, which does too.
     fine = {k: fit(1, best + k)[0] for k in range(-_SHIFTS, _SHIFTS + 1)}
     k = min(sorted(fine, key=abs), key=lambda k: fine[k])
     pays = min(fine[0], fit(1, best + k, best - k)[0]) > fine[k] * t.size ** (1.0 / t.size)

@@ -47,7 +47,7 @@ INPUT_PARAMETERS = (
 # Fields of the state that the filter uses.
 _FIELDS = ('sigma_se', 'alpha', 'throttle', 'load_noise')
 _UNKNOWN = [NAN] * len(_FIELDS)
-# Minimum ratio of the window of sigma to the sliding window if sigma comes from a longer fit.
+# Ratio of sigma's window to the sliding window above which sigma is from a longer fit.
 _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 

@@ -76,7 +76,6 @@ class MonitorNode(Node):
         self._faulted = -math.inf
         # Error that ended the thread's work; '' if none.
         self.problem = ''
-        # Set to end the thread's work.
         self.ending = Event()
         self._thread: Thread | None = None
         self._publishing: Timer | None = None
@@ -313,8 +312,8 @@ class MonitorNode(Node):
                 'changed, until the node is restarted without it')
         if self.running and any(p.name in self._fixed for p in parameters):
             return SetParametersResult(
-                successful=False, reason='it is read when the node is activated: deactivate it '
-                'first')
+                successful=False, reason='it is read when the node is activated: deactivate the '
+                'node first')
         try:
             if changed:
                 self.check({**self.values(), **changed})

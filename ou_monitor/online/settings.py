@@ -109,11 +109,10 @@ class MonitorSettings:
         'begins, from 0.001 to below 1 (default: half, our choice).', 0.001, 1.0)
     brownout_hold: float = _parameter(
         1.0, 'Minimum duration of WARN and CRITICAL, also while the risk is unknown, s (default: '
-        'with 2 s, the flag was set without a dip for twice as long on five recorded quads).',
-        0.0, 3600.0)
+        'with 2 s, false alarms lasted twice as long on five recorded quads).', 0.0, 3600.0)
     brownout_delay: float = _parameter(
         0.15, 'Time that a risk must last before WARN or CRITICAL begins, s (default: three '
-        'reports, with half as many false alarms on recorded quads as two; ArduPilot waits 10 s '
+        'reports; two gave twice as many false alarms on recorded quads; ArduPilot waits 10 s '
         'before a voltage failsafe).', 0.0, 3600.0)
     brownout_latch: bool = _parameter(
         False, 'Whether CRITICAL stays until ~/clear_brownout is called or this parameter is set '

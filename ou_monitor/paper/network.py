@@ -248,7 +248,6 @@ class Rail:
     @cached_property
     def alpha(self) -> float:
         """Relaxation rate, 1/s: the slowest pole that carries 1 % of Var_inf or more."""
-        # NaN without noise.
         if self.var_inf == 0.0:
             return math.nan
         poles, vectors = np.linalg.eig(self.a)

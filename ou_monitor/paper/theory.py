@@ -432,7 +432,7 @@ def require_balance(system: SwitchedSystem) -> None:
         i, *j = np.unravel_index(int(np.argmax(np.abs(average))), average.shape)
         worst = float(average[(i, *j)])
         if abs(worst) > BALANCE_TOLERANCE * float(np.abs(switched).max()):
-            what = (f'has {worst:+.6g} 1/s times component {j[0]}' if j else
+            what = (f'has a coefficient of {worst:+.6g} 1/s for component {j[0]}' if j else
                     f'is {worst:+.6g} per second at u = 0')
             raise ValueError(
                 f'the balance condition does not hold: the averaged velocity of component {i} '

@@ -185,7 +185,6 @@ class BagReader:
             raise InputError(f'{self.path} holds no messages ({why})')
 
     def _collect(self) -> None:
-        """Merge the topics of all files."""
         for file in self._files:
             for key, topic in file.topics.items():
                 if topic.sample_rate is not None:
@@ -219,7 +218,6 @@ class BagReader:
         read = place = 0
         while place < len(spans):
             file, first, size = spans[place][1], place, 0
-            # Small chunks are read together.
             while place < len(spans) and spans[place][1] is file and (
                     place == first or size + spans[place][0].unpacked <= _TOGETHER):
                 size += spans[place][0].unpacked
@@ -411,7 +409,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise self._write_error(error) from error
 
     def _metadata(self) -> dict[str, Any]:
-        """Return the content of metadata.yaml (version 9)."""
         start_ns = self._start_ns or 0
         duration = {'nanoseconds': self._end_ns - start_ns}
         start = {'nanoseconds_since_epoch': start_ns}

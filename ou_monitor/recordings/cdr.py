@@ -40,7 +40,7 @@ Rows = npt.NDArray[np.uint8]
 # Representation identifier and options.
 _HEADER = 4
 
-# Maximum steps of a walk beyond four per byte (a few bytes may state 2^32 empty elements); depth.
+# Limits of a walk: steps beyond 4 per byte (few bytes may state 2^32 empty elements), and depth.
 _FREE_STEPS, _MOST_DEPTH = 1000, 50
 # Maximum number of layouts kept for messages of one size, and of length words in a kept layout; a
 # topic with more has no recurring layout.

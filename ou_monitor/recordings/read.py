@@ -93,7 +93,7 @@ def _read(
     start: float | None = None, end: float | None = None, flight: int | None = None,
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, Log | None]:
-    """Read a recording, repeats included; if it is a log, return this too, with `signal`."""
+    """Read a recording, repeats included; of a log, return also the `Log`, with `signal`."""
     _check_part(start, end)
     csv, log = is_csv(path), is_log(path)
     for option, value in (('msg-config', msg_config), ('voltage-topic', voltage_topic),
@@ -163,7 +163,6 @@ def tidy(raw: RawColumns) -> Recording:
 
 
 def _check_part(start: float | None, end: float | None) -> None:
-    """Refuse an empty or negative part."""
     for name, value in (('start', start), ('end', end)):
         if value is not None and not (math.isfinite(value) and value >= 0.0):
             raise InputError(f'the {name} of the part to read must be 0 s or later, got {value} s')

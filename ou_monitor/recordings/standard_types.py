@@ -1,12 +1,11 @@
 """
 Message types: parsing of definitions, and the standard types that bags are written with.
 
-A bag carries the definition (ros2msg) of every type in it, so that it can be read
-without ROS.  Texts and hashes are from ROS 2 Jazzy's
-common_interfaces, without comments; a test compares them with an independent
-library.  rosbag2 writes the hash (REP-2016, RIHS01) beside the type.
-Many messages are encoded at once: the library encodes one, and its layout shows where the others
-differ.
+A bag carries the definition (ros2msg) of every type in it, so that it can be read without ROS.
+Texts and hashes are from ROS 2 Jazzy's common_interfaces, without comments; a test compares them
+with an independent library.  rosbag2 writes the hash (REP-2016, RIHS01) beside the type.
+Many messages are encoded at once: the library encodes one, and its layout shows where to write the
+values of the others.
 """
 
 from __future__ import annotations
@@ -32,9 +31,8 @@ FLOAT64 = 'std_msgs/msg/Float64'
 FLOAT32_ARRAY = 'std_msgs/msg/Float32MultiArray'
 BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 
-_SEPARATOR = 80 * '='
-
 # rosbag2 prints this line between a definition and the definitions it uses.
+_SEPARATOR = 80 * '='
 _STD_HEADER = f"""\
 {_SEPARATOR}
 MSG: std_msgs/Header

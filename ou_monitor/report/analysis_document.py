@@ -256,7 +256,6 @@ def _by_throttle(analysis: Analysis) -> Part:
 
 
 def _deepest(analysis: Analysis) -> list[Part]:
-    """Return the deepest dips, one by one."""
     dips = analysis.overview.facts.dips
     if dips is None or not dips.count:
         return []
@@ -325,7 +324,6 @@ def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArr
 
 
 def _fits(analysis: Analysis) -> list[Part]:
-    """Return sigma and alpha over throttle, if two levels have them."""
     levels = [level for level in analysis.levels
               if math.isfinite(level.throttle) and level.estimate.usable]
     if len(levels) < 2:
@@ -390,8 +388,8 @@ def _process(analysis: Analysis) -> list[Part]:
         lambda: [Table(['throttle', *_TESTS.values()], rows, left=[0]), Text(
             'p-values, Holm-adjusted over all tests of all levels; below each, the effect size. '
             '* marks a rejection: p below 0.01 and an effect large enough to matter. Every supply '
-            'that relaxes is "correlated"; with stationary OU levels, one recording in a hundred '
-            'shows any other rejection.')],
+            'that relaxes is "correlated"; of recordings with stationary OU levels, one in a '
+            'hundred has a rejection in any other column.')],
         Notes.of(reasons)]
 
 

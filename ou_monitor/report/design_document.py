@@ -78,16 +78,14 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
     cells = f'{counted(network.cells, "cell")} ({origin})' if network.cells else (
         'taken as a rail, whose regulator is a constant voltage behind a resistance')
     regulator = '' if network.regulator_voltage else (
-        ' Regulators that it feeds are left out: their current is in the recorded voltage.')
+        ' Regulators on this supply are left out: the recorded voltage includes their effect.')
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
     changed = '' if math.isclose(network.battery_voltage, flight.level) else (
         f', changed to {network.battery_voltage:.4g} V')
     return (f'From the recording: {flight.level:.4g} V without load at its end{changed} (by the '
-            f'load model; the risks include its error), {cells} (highest median of 0.5 s '
-            f'{flight.full:.4g} V; --cells N for a pack of N cells), sag '
-            f'{sag:.3g} V (+- {2.0 * se:.2g} V, included in the risks, which are computed as in '
-            'analyze, with the sag and noise of each row) and noise '
+            f'load model), {cells} (highest median of 0.5 s {flight.full:.4g} V; --cells N for a '
+            f'pack of N cells), sag {sag:.3g} V (+- {2.0 * se:.2g} V) and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{percent(throttle)} throttle, resistance '
             + ('unknown without a measured current (--set battery_resistance=OHM): it is shown '
@@ -96,8 +94,9 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
                + (f' in place of the recorded {1e3 * flight.resistance:.3g} mOhm, at the recorded '
                   'current.' if flight.resistance > 0.0 and not math.isclose(
                       network.battery_resistance, flight.resistance) else '.'))
-            + ('' if math.isfinite(flight.alpha) else ' It shows no relaxation: alpha of slow '
-               f'noise is assumed to be {number(network.flutter_rate)} 1/s.')
-            + regulator
+            + ('' if math.isfinite(flight.alpha) else ' The flight shows no relaxation: alpha of '
+               f'slow noise is assumed to be {number(network.flutter_rate)} 1/s.')
+            + ' The risks include the errors of voltage and sag, and are computed as in analyze, '
+            'with the sag and noise of each row.' + regulator
             + ' A recording shows neither bulk capacitor nor ESR: state those of the recorded '
             'craft (--set bulk_capacitance=470uF).')

@@ -96,7 +96,6 @@ class _Track:
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:
-        """Update the track by a message."""
         if number > self.number:
             interval = (time - self.time) / (number - self.number)
             self.interval = interval if math.isnan(self.interval) else (

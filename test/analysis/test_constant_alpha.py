@@ -106,7 +106,7 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
     assert 'depends on load: only one throttle' in alone.sentence
     none = alpha_constancy(THROTTLES, four, [True] * 4)
     assert none.levels == 0 and math.isnan(none.alpha)
-    assert 'no throttle held long enough has a usable fit that one OU describes' in none.sentence
+    assert 'no throttle held long enough has a usable fit and is described by' in none.sentence
 
 
 def test_a_tone_is_not_taken_for_another_alpha():

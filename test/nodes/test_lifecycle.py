@@ -88,7 +88,7 @@ def test_a_configuration_that_fails_can_be_mended(world):
     assert manager.change(Transition.TRANSITION_ACTIVATE)
     # While it is active what is read at its beginning cannot be changed; the rest can.
     answer = probe.set_parameter('/ou_estimator', 'msg_config', 'auto')
-    assert not answer.successful and 'deactivate it first' in answer.reason
+    assert not answer.successful and 'deactivate the node first' in answer.reason
     assert probe.set_parameter('/ou_estimator', 'window', 3.0).successful
     assert manager.change(Transition.TRANSITION_DEACTIVATE)
     assert probe.set_parameter('/ou_estimator', 'window', 4.0).successful

@@ -37,7 +37,7 @@ def test_intensity_and_drift_are_integrals_of_correlations():
 
 
 @pytest.mark.parametrize('matrices, offsets, message', [
-    ([[[1.0]], [[1.0]]], [[0.0], [0.0]], r'component 0 has \+1 1/s times component 0'),
+    ([[[1.0]], [[1.0]]], [[0.0], [0.0]], r'a coefficient of \+1 1/s for component 0'),
     ([[[0.0]], [[0.0]]], [[1.0], [-0.5]], r'component 0 is \+0.25 per second at u = 0'),
 ])
 def test_without_balance_the_limit_is_refused(matrices, offsets, message):

@@ -537,7 +537,6 @@ class RelaxationFits:
             self._thread.start()
 
     def _fit(self, readings: FloatArray, line: int) -> None:
-        """Fit in the thread."""
         begin = time.thread_time()
         found: OuFacts | Exception
         try:

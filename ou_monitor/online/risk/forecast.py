@@ -53,9 +53,9 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 # Coefficients of the power series of the tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
-# Prior of the law: weight of the variances, in horizons; variances k0 and k1 (on nine recorded
-# flights, from gecko to cf_takeoff, 1 to 6 and 0.015 to 0.09), and k2, as the load filter states
-# its error; precision matrix of bias and gain (elements 00, 01, 11).
+# Prior of the law: weight of the variances, in horizons; k0 (1 to 6 on nine recorded flights, from
+# gecko to cf_takeoff), k1 (0.015 to 0.09 on these), and k2 (1: the load filter's stated error is
+# right); precision matrix of bias and gain (elements 00, 01, 11).
 _PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03, 1.0])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
 # Memory, s; limit of squared standardised errors; standardised error beyond which errors weigh
@@ -117,7 +117,7 @@ class Calibrator:
     """Learns a `LowestLaw` from completed horizons."""
 
     def __init__(self) -> None:
-        # Regression on noise and predicted fall: sums of their products, and with the fall.
+        # Normal equations of the regression of the fall on noise and predicted fall.
         self._information: tuple[float, ...] = _PRECISION
         self._weighted: tuple[float, ...] = _PRECISION[1:]
         # For each variance: effective number of horizons, and sum of the variances they imply.

@@ -80,8 +80,8 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'At least {counted(dropped, "frame")} dropped: no intact key frame before '
                      'them.')
     if broken:
-        notes.append(f'{counted(broken, "piece")} unknown to orangebox left out: broken bytes, or '
-                     'events of newer firmware.')
+        notes.append(f'Left out: {counted(broken, "piece")} that orangebox cannot read, broken '
+                     'bytes or events of newer firmware.')
     if not parser._end_of_log:
         notes.append(Note(f'Flight {wanted} has no end mark, so it was probably cut off; '
                           f'{end} of {size} bytes of frames were read.', Defect.DAMAGED_FILE))
@@ -114,7 +114,6 @@ def read(path: Path, request: Request) -> Log:
 
 
 def _wanted(names: list[str], request: Request) -> list[str]:
-    """Return the wanted fields, the time first."""
     kinds = ('vbatLatest', 'vbat', 'sagCompensatedVBat', 'amperageLatest', 'amperage',
              'rcCommand[3]', 'setpoint[3]')
     arrays = r'(motor|gyroADC|gyroUnfilt|accSmooth|eRPM|debug)\[\d+\]'

@@ -137,7 +137,7 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
 
 def _close(log: Any) -> None:
     for name in ('data_map', 'filehandle'):
-        # A memory map that a failed `__init__` still uses cannot be closed; it goes with the log.
+        # A memory map that a failed `__init__` still uses cannot be closed; it is freed with it.
         with suppress(BufferError):
             if hasattr(log, name):
                 getattr(log, name).close()
@@ -214,7 +214,7 @@ def _lost_binary(log: Any) -> list[str]:
     where = (f'cut off at byte {end}' if lost == len(tail) else
              f'damaged, its last whole message ends at byte {end}')
     return [Note(f'{lost} of {size} bytes belong to no message, so the log is {where}; '
-                 'the messages around that were read.', Defect.DAMAGED_FILE)]
+                 'the other messages were read.', Defect.DAMAGED_FILE)]
 
 
 def _lost_text(log: Any) -> list[str]:
@@ -228,7 +228,7 @@ def _lost_text(log: Any) -> list[str]:
         lost += bool(line.strip()) and (form is None or len(cells) <= len(form.format))
     notes = []
     if lost:
-        notes.append(f'Left out: {counted(lost, "line")} in no format of this log.')
+        notes.append(f'Left out: {counted(lost, "line")} not in any format of this log.')
     if not text.endswith('\n'):
         notes.append(Note(f'The last line does not end: the log was cut off at byte {size}.',
                           Defect.DAMAGED_FILE))

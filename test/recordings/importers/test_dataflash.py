@@ -105,7 +105,7 @@ def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
             held = int(ends[np.searchsorted(ends, at) - 1])
             assert log.notes == (
                 f'{at - held} of {at} bytes belong to no message, so the log is cut off at byte '
-                f'{held}; the messages around that were read.',)
+                f'{held}; the other messages were read.',)
         else:
             assert log.notes == ()
 
@@ -129,7 +129,7 @@ def test_text_log_with_binary_bytes(tmp_path):
     path, log = load(tmp_path, text[:at] + b'\xfe\xff' + text[at + 2:], 'a.log')
     assert choose(path, log).voltage.n == 29
     assert log.notes == ('2 bytes that are not ASCII were read as "?".',
-                         'Left out: 1 line in no format of this log.')
+                         'Left out: 1 line not in any format of this log.')
 
 
 def test_messages_of_the_parser_are_suppressed(tmp_path, capfd):
@@ -143,7 +143,7 @@ def test_a_text_log_cut_off(tmp_path):
     text = copter(30)[0].text
     path, log = load(tmp_path, text[:-7], 'a.log')
     assert log.notes == (
-        'Left out: 1 line in no format of this log.',
+        'Left out: 1 line not in any format of this log.',
         f'The last line does not end: the log was cut off at byte {len(text) - 7}.')
     assert choose(path, log).voltage.n == 30
 
