@@ -15,8 +15,9 @@ import pytest
 RUNS = {**golden_runs.RUNS, **golden_models.RUNS, **golden_parts.RUNS}
 # Another BLAS or version of NumPy moves numbers by less; what is below the second is nothing.
 RELATIVE, ABSOLUTE = 1e-5, 1e-9
-# Evidence comes from searches that stop near the maximum: two processors differ by 1.3e-5.
-OF_SEARCHES = {'discovery': 1e-4}
+# Evidence comes from searches that stop near the maximum: two processors differ by 4.2e-4, that
+# is 0.2 nats.
+OF_SEARCHES = {'discovery': 1e-3}
 
 
 @pytest.mark.parametrize('name', RUNS)
