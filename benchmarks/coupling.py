@@ -56,7 +56,7 @@ def flights(folder: Path) -> Iterator[Flight]:
         log = import_log(path, Request(number or 1))
         volts = 'battery_status[1].voltage_v' if name == 'px4' else None
         chosen = choose(path, log, voltage=volts)
-        axes = {f'{one.name} {axis}': one.vectors['angular_velocity'][:, k]
+        axes = {f'{one.name} {axis}': one.values[:, k]
                 for one in log.inertial if one.t.size == log.inertial[0].t.size
                 for k, axis in enumerate('xyz')}
         series = chosen.throttle

@@ -54,6 +54,6 @@ def read(name: str, seconds: float = np.inf) -> Gyro | None:
     rpm = None
     if log.speeds is not None:
         place = np.clip(np.searchsorted(log.speeds.t, t, 'right') - 1, 0, None)
-        rpm = 60.0 / (2.0 * np.pi) * log.speeds.vectors['velocity'][place]
+        rpm = 60.0 / (2.0 * np.pi) * log.speeds.values[place]
     return Gyro(name, t - t[0], (t.size - 1) / float(t[-1] - t[0]),
-                np.degrees(gyro.vectors['angular_velocity'][part]), held, rpm)
+                np.degrees(gyro.values[part, :3]), held, rpm)

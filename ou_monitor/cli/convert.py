@@ -65,7 +65,7 @@ def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
     found = {'voltage': chosen.voltage, 'throttle': chosen.throttle, 'current': chosen.current,
              **extras.signals, 'imu': extras.imu, 'motor_speed': extras.speeds}
     return {f'/{topic}': {'field': one.name, 'scale': one.scale, 'what': one.words,
-                          'unit': one.unit, 'n': int(one.t.size)}
+                          'unit': one.unit, 'n': one.n}
             for topic, one in found.items() if one is not None}
 
 
@@ -91,7 +91,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
     gyros = _gyros(log, default_gyro(log))
     several = [f'Several series are candidates for {quantity}: choose by --{quantity} NAME.'
                for quantity in (VOLTAGE, THROTTLE) if len(taken[quantity]) > 1]
-    speeds = [] if log.speeds is None else list(log.speeds.motors)
+    speeds = [] if log.speeds is None else log.speeds.name.split(', ')
     parts: list[Part] = [
         Table(('', 'quantity', 'name', 'samples', 'rate Hz', 'min', 'max', 'unit', 'repeats',
                'what'), [
@@ -102,7 +102,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             ['*' if row['default'] else '', row['name'], str(row['n']), row['what']
              + ('' if row['acceleration'] else ', no accelerometer')] for row in gyros],
               left=(0, 1, 3)),
-        Text(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
+        Text(f'* /motor_speed: {log.speeds.words}, {log.speeds.n} samples, '
              f"{', '.join(speeds)}" if speeds else ''), Notes.of([*several, *log.notes])]
     output.tell(args, Document('A log', f'{args.log}: {log.format}' + ''.join(
         f', {name} {value}' for name, value in log.facts.items()), (), parts), lambda: {
@@ -113,7 +113,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
 
 def _gyros(log: Any, taken: Any) -> list[dict[str, Any]]:
     """Return the series that could become sensor_msgs/Imu."""
-    return [{'name': one.name, 'what': one.words, 'n': int(one.t.size), 'scale': one.scale,
-             'angular_velocity': 'angular_velocity' in one.vectors,
-             'acceleration': 'linear_acceleration' in one.vectors, 'default': one is taken}
+    return [{'name': one.name, 'what': one.words, 'n': one.n, 'scale': one.scale,
+             'angular_velocity': True, 'acceleration': one.values.shape[1] > 3,
+             'default': one is taken}
             for one in log.inertial]

@@ -181,9 +181,10 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
                                     'design_capacity', 'percentage'), math.nan))
 
 
-def encode_imu(stamps_ns: npt.NDArray[np.int64], vectors: Mapping[str, npt.NDArray[np.float64]],
-               ) -> list[bytes]:
-    """Return one Imu per stamp, ns, in `base_link` (vectors in rad/s and m/s^2, shape (n, 3))."""
+def encode_imu(stamps_ns: npt.NDArray[np.int64], values: npt.NDArray[np.float64]) -> list[bytes]:
+    """Return one Imu per stamp, ns, in `base_link` (rad/s, shape (n, 3); m/s^2 beside it)."""
+    vectors = dict(zip(('angular_velocity', 'linear_acceleration'),
+                       np.hsplit(values, values.shape[1] // 3)))
     # By the message definition -1 means not measured, and 0 an unknown covariance.
     unmeasured = {f'{name}_covariance': [-1.0, *[0.0] * 8] for name in (
         'orientation', 'angular_velocity', 'linear_acceleration') if name not in vectors}

@@ -11,7 +11,7 @@ series std_msgs/Float64; the metadata of the bag have their units.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import heapq
 import math
 from pathlib import Path
@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.importers.choose import ChosenSeries, Extras, SPEEDS
-from ou_monitor.recordings.importers.log import Motion, Series, VELOCITY
+from ou_monitor.recordings.importers.choose import ChosenSeries, Extras
+from ou_monitor.recordings.importers.log import Series, SPEEDS
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_blocks, encode_imu, encode_joints, encode_scalars,
     FLOAT32, FLOAT32_ARRAY, FLOAT64, IMU, JOINT_STATE)
@@ -168,7 +168,7 @@ def write_log(
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Write a bag (progress 0..1)."""
     # At equal times the voltage comes last, after the values that hold for it.
-    held: dict[str, Series | Motion | None] = {
+    held: dict[str, Series | None] = {
         'throttle': chosen.throttle, 'current': chosen.current, 'imu': extras.imu,
         SPEEDS: extras.speeds, **extras.signals, 'voltage': chosen.voltage}
     streams = {topic: one for topic, one in held.items() if one is not None}
@@ -198,22 +198,17 @@ def write_log(
     return bag.topics, _moved(shift)
 
 
-def _messages(place: int, kind: str, stamps: Stamps, one: Series | Motion) -> Iterator[Timed]:
+def _messages(place: int, kind: str, stamps: Stamps, one: Series) -> Iterator[Timed]:
     """Yield the messages of one topic."""
+    motors = one.name.split(', ')
     for first in range(0, stamps.size, SLICE):
         part = slice(first, first + SLICE)
-        now = stamps[part]
-        if isinstance(one, Series):
-            yield from _timed(place, encode(kind, now, one.values[part]))
-        else:
-            vectors = {field: values[part] for field, values in one.vectors.items()}
-            yield from _timed(place, zip(now.tolist(), encode_joints(
-                now, one.motors, vectors[VELOCITY]) if one.motors else encode_imu(now, vectors),
-                strict=True))
+        yield from _timed(place, encode(kind, stamps[part], one.values[part], motors))
 
 
-def encode(kind: str, stamps: Stamps, values: FloatArray) -> Iterator[tuple[int, bytes]]:
-    """Yield messages of numbers with their log times, ns (of a block: of its last sample)."""
+def encode(kind: str, stamps: Stamps, values: FloatArray, motors: Sequence[str] = (),
+           ) -> Iterator[tuple[int, bytes]]:
+    """Yield messages with their log times, ns (of a block: of its last sample)."""
     if kind == FLOAT32_ARRAY:
         whole = stamps.size - stamps.size % BLOCK
         yield from zip(stamps[BLOCK - 1:whole:BLOCK].tolist(),
@@ -221,5 +216,8 @@ def encode(kind: str, stamps: Stamps, values: FloatArray) -> Iterator[tuple[int,
         if whole < stamps.size:
             yield int(stamps[-1]), encode_blocks(values[None, whole:])[0]
         return
-    yield from zip(stamps.tolist(), encode_battery(stamps, values) if kind == BATTERY_STATE
-                   else encode_scalars(kind, values), strict=True)
+    yield from zip(stamps.tolist(), (
+        encode_battery(stamps, values) if kind == BATTERY_STATE else
+        encode_imu(stamps, values) if kind == IMU else
+        encode_joints(stamps, motors, values) if kind == JOINT_STATE else
+        encode_scalars(kind, values)), strict=True)

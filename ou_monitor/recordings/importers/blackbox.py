@@ -26,7 +26,7 @@ from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, Request, RPM, Series,
+    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Request, RPM, Series,
     SIGNAL, speeds_of, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
@@ -309,7 +309,7 @@ def _units(headers: Headers) -> Units:
 
 
 def _gyros(t: FloatArray, columns: Fields, headers: Headers, units: Units, notes: list[str],
-           ) -> Iterator[Motion]:
+           ) -> Iterator[Series]:
     """Yield the gyros that the log holds, with the accelerometer (t in s)."""
     forces = _three(columns, ACCELEROMETER)
     words = 'no accelerometer'
@@ -362,7 +362,7 @@ def _signals(t: FloatArray, columns: Fields, units: Units, known: set[str]) -> I
 
 
 def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
-            poles: int | None) -> Motion | None:
+            poles: int | None) -> Series | None:
     places = sorted(int(found[1]) for name in columns
                     if (found := re.fullmatch(r'eRPM\[(\d+)\]', name)))
     if not places:

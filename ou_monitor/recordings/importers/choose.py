@@ -18,8 +18,7 @@ import re
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, Log, Motion, RawColumns, Series, sound, THROTTLE,
-    UNKNOWN, VOLTAGE)
+    ANY, clean, CURRENT, IMU, Log, RawColumns, Series, SPEEDS, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note, prefixed
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline import check_throttle
@@ -192,7 +191,6 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
     return notes
 
 
-IMU, SPEEDS = 'imu', 'motor_speed'
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
 # Number of parts of a series whose rates are compared; ratio of rates above which this is noted.
@@ -205,8 +203,8 @@ _GAP = 3.0
 class Extras:
     """Series chosen from a log beside voltage, throttle and current."""
 
-    imu: Motion | None  # Gyro, with its accelerometer
-    speeds: Motion | None  # Speeds of the motors
+    imu: Series | None  # Gyro, with its accelerometer
+    speeds: Series | None  # Speeds of the motors
     signals: dict[str, Series]  # By topic, without the slash
     notes: tuple[str, ...]  # Dropped samples, and quantities missing in the log
 
@@ -217,9 +215,9 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None,
     notes: list[str] = []
     gyro = _gyro(path, log, imu)
     if gyro is not None:
-        gyro, said = clean_motion(gyro)
+        gyro, said = clean(gyro)
         notes += prefixed(gyro.name, (*said, *pace_notes(gyro.t)))
-        if not gyro.t.size:
+        if not gyro.n:
             notes.append(f'{gyro.name} has no usable sample.')
             gyro = None
     if gyro is None and imu != NONE and log.format != 'csv':
@@ -229,9 +227,9 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None,
         notes.append(f"Also in the log: {', '.join(others)} (--imu NAME).")
     speeds = log.speeds
     if speeds is not None:
-        speeds, said = clean_motion(speeds)
+        speeds, said = clean(speeds)
         notes += prefixed(SPEEDS, said)
-        speeds = speeds if speeds.t.size else None
+        speeds = speeds if speeds.n else None
     named: dict[str, Series] = {}
     for name in dict.fromkeys(signals):
         series, said = _cleaned(path, name, named_series(path, log, name))
@@ -242,9 +240,9 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None,
     return Extras(gyro, speeds, named, tuple(notes))
 
 
-def default_gyro(log: Log) -> Motion | None:
+def default_gyro(log: Log) -> Series | None:
     """Return the default series for /imu."""
-    return min((one for one in log.inertial if one.rank is not None and one.t.size),
+    return min((one for one in log.inertial if one.rank is not None and one.n),
                key=lambda one: one.rank or 0, default=None)
 
 
@@ -295,7 +293,7 @@ def _unused_topic(topic: str, taken: set[str]) -> str:
     return free
 
 
-def _gyro(path: Path, log: Log, name: str | None) -> Motion | None:
+def _gyro(path: Path, log: Log, name: str | None) -> Series | None:
     """Return the gyro of a name; None: the default, if there is one."""
     if name is None or name == NONE:
         return None if name else default_gyro(log)
@@ -304,13 +302,6 @@ def _gyro(path: Path, log: Log, name: str | None) -> Motion | None:
         raise InputError(f"{path} has no gyro '{name}': "
                          + (nearest(name, known) if known else 'it holds none'))
     return log.inertial[known.index(name)]
-
-
-def clean_motion(one: Motion) -> tuple[Motion, tuple[str, ...]]:
-    """Return finite rows with rising stamps, and notes on dropped ones."""
-    which, notes = sound(one.t, np.hstack([*one.vectors.values()]))
-    vectors = {field: values[which] for field, values in one.vectors.items()}
-    return replace(one, t=one.t[which], vectors=vectors), tuple(notes)
 
 
 def pace_notes(t: FloatArray) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from zlib import crc32
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, one_flight, Request, Series, SIGNAL,
+    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, one_flight, Request, Series, SIGNAL,
     three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
@@ -80,7 +80,7 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: '
                      'they are not records of this log.')
     series: list[Series] = []
-    inertial: list[Motion] = []
+    inertial: list[Series] = []
     for key, event in events.items():
         size = event.row.itemsize
         rows = np.frombuffer(b''.join(data[at:at + size] for at in found[key]), dtype=event.row)
@@ -164,7 +164,7 @@ def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Itera
                          'as logged' if own == UNKNOWN else name.partition('.')[0], own_unit=own)
 
 
-def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Motion]:
+def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
     """Yield the gyro with the accelerometer."""
     rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'], factor)
                      for group, factor in ((_GYRO, DEGREE), (_FORCE, GRAVITY)))

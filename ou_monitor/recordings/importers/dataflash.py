@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet_process, Request,
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, one_flight, quiet_process, Request,
     RPM, Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
@@ -292,7 +292,7 @@ def _other_fields(name: str, columns: Columns, form: Any, known: set[str]) -> It
                          group=name, own_unit=units.get(field, UNKNOWN))
 
 
-def _gyros(table: Table) -> Iterator[Motion]:
+def _gyros(table: Table) -> Iterator[Series]:
     """Yield each gyro, with the accelerometer of its message, along front, left and up."""
     first: set[str] = set()
     for (kind, instance), columns in table.items():
@@ -305,7 +305,7 @@ def _gyros(table: Table) -> Iterator[Motion]:
         first.add(kind)
 
 
-def _speeds(table: Table) -> Motion | None:
+def _speeds(table: Table) -> Series | None:
     """Return the speeds that ESCs reported, at the stamps of the first one."""
     kind, field = SPEED
     found = {instance: columns for (name, instance), columns in table.items()

@@ -19,7 +19,6 @@ import math
 import os
 from pathlib import Path
 import sys
-from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -36,53 +35,15 @@ GRAVITY = 9.80665  # m/s^2, the scale of accelerometers
 RPM = 2.0 * math.pi / 60.0
 
 
-# Fields of the messages that hold motion: rad/s and m/s^2 along the axes of `base_link`, the
-# acceleration as specific force (gravity included); rotors, rad/s.
-RATE, FORCE, VELOCITY = 'angular_velocity', 'linear_acceleration', 'velocity'
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A gyro with its accelerometer, if it has one, or the speeds of all motors."""
-
-    name: str  # Name for the user
-    t: FloatArray  # Stamps, s from the start of the log; shape (n,)
-    vectors: dict[str, FloatArray]  # Field -> values, shape (n, 3) or (n, motors)
-    # Conversion of the values, poles included; description.
-    scale: str
-    words: str
-    rank: int | None = None  # The smallest rank is the default; None: only taken by name
-    # Names of the motors, as in the message: ``motor_0``; empty for a gyro.
-    motors: tuple[str, ...] = ()
-
-    @property
-    def unit(self) -> str:
-        """Return the units of the values."""
-        return 'rad/s' if self.motors else 'rad/s, m/s^2'
-
-
-def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
-            scale: str, words: str, rank: int | None = None) -> Iterator[Motion]:
-    """Yield a gyro with its accelerometer (None: there is none); see `Motion`."""
-    if rates is not None:
-        yield Motion(name, t, {RATE: rates, **({} if forces is None else {FORCE: forces})},
-                     scale, words, rank)
-
-
-def speeds_of(t: FloatArray, rpm: Sequence[FloatArray], factor: float, scale: str, words: str,
-              numbers: Iterable[object]) -> Motion:
-    """Return the speeds of motors by their numbers (factor to rad/s); see `Motion`."""
-    motors = tuple(f'motor_{number}' for number in numbers)
-    return Motion(', '.join(motors), t, {VELOCITY: np.column_stack(rpm) * factor},
-                  f'{scale} {factor:.6g}', words, motors=motors)
-
-
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # A column of unknown kind.
 ANY = 'any'
 # Any other series, such as a gyro axis: chosen by name only.
 SIGNAL = 'signal'
-UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A'}
+# A gyro with its accelerometer, along the axes of `base_link`, the acceleration as specific force
+# (gravity included); the speeds of all motors.
+IMU, SPEEDS = 'imu', 'motor_speed'
+UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A', IMU: 'rad/s, m/s^2', SPEEDS: 'rad/s'}
 UNKNOWN = '?'
 
 # Maximum magnitude: larger values come from corrupt bytes, and a message could not hold them.
@@ -97,11 +58,12 @@ Progress = Callable[[float], None]
 class Series:
     """One quantity over time, in SI units."""
 
-    name: str  # Name for the user, unique in the log: ``BAT[0].Volt``
-    quantity: str  # VOLTAGE, THROTTLE, CURRENT, SIGNAL or ANY
+    # Name for the user, unique in the log: ``BAT[0].Volt``; of SPEEDS, the names of the motors.
+    name: str
+    quantity: str  # VOLTAGE, THROTTLE, CURRENT, SIGNAL, ANY, IMU or SPEEDS
     t: FloatArray  # Stamps, s from the start of the log; shape (n,)
     # V, 0..1, or A (positive when the battery is drained); NaN where the log says "unknown";
-    # shape (n,).
+    # shape (n,).  Of IMU (n, 3), or (n, 6) with accelerometer; of SPEEDS (n, motors).
     values: FloatArray
     scale: str  # Conversion from the logged value
     words: str = ''  # Description
@@ -148,8 +110,8 @@ class Log:
     # Vehicle, firmware, number of the flight, as far as known.
     facts: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Dropped or unreadable parts, one sentence each
-    inertial: tuple[Motion, ...] = ()  # Gyros and accelerometers
-    speeds: Motion | None = None  # Speeds of the motors
+    inertial: tuple[Series, ...] = ()  # Gyros and accelerometers
+    speeds: Series | None = None  # Speeds of the motors
     names: tuple[str, ...] = ()  # Names of all series of the file, unread ones included
 
 
@@ -241,7 +203,7 @@ def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
 
 def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
     """Return a series with finite values and rising stamps, and notes on changes."""
-    which, notes = sound(series.t, series.values[:, None])
+    which, notes = sound(series.t, series.values.reshape(series.n, -1))
     values = series.values[which]
     if series.quantity == THROTTLE:
         outside = int(((values < -0.01) | (values > 1.01)).sum())
@@ -289,23 +251,35 @@ def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
     return good
 
 
-_Timed = TypeVar('_Timed', bound=Any)
-
-
 def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: Iterable[str],
-           names: Iterable[str], inertial: Iterable[Motion] = (),
-           speeds: Motion | None = None, start: float = math.inf) -> Log:
+           names: Iterable[str], inertial: Iterable[Series] = (),
+           speeds: Series | None = None, start: float = math.inf) -> Log:
     """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
     # Corrupt bytes may give an early stamp: it counts only if others are near it.
     start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
 
-    def shifted(parts: Iterable[_Timed]) -> tuple[_Timed, ...]:
+    def shifted(parts: Iterable[Series]) -> tuple[Series, ...]:
         return tuple(replace(one, t=one.t - start) if math.isfinite(start) else one
                      for one in parts)
 
     return Log(form, shifted(series), facts, tuple(notes), shifted(inertial),
                next(iter(shifted([speeds] if speeds else [])), None),
                tuple(dict.fromkeys(names)))
+
+
+def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
+            scale: str, words: str, rank: int | None = None) -> Iterator[Series]:
+    """Yield a gyro with its accelerometer (None: there is none)."""
+    if rates is not None:
+        values = rates if forces is None else np.hstack([rates, forces])
+        yield Series(name, IMU, t, values, scale, words, rank)
+
+
+def speeds_of(t: FloatArray, rpm: Sequence[FloatArray], factor: float, scale: str, words: str,
+              numbers: Iterable[object]) -> Series:
+    """Return the speeds of motors by their numbers (factor to rad/s)."""
+    return Series(', '.join(f'motor_{number}' for number in numbers), SPEEDS, t,
+                  np.column_stack(rpm) * factor, f'{scale} {factor:.6g}', words)
 
 
 def started(unix: float) -> dict[str, str]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, Progress, quiet, Request, RPM,
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, one_flight, Progress, quiet, Request, RPM,
     Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
@@ -136,8 +136,8 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'The logger lost data {counted(len(ulog.dropouts), "time")}, {lost:.3f} s '
                      'in all.')
     series: list[Series] = []
-    inertial: list[Motion] = []
-    speeds: Motion | None = None
+    inertial: list[Series] = []
+    speeds: Series | None = None
     for data in ulog.data_list:
         columns = {field: np.asarray(values, dtype=np.float64)
                    for field, values in data.data.items() if not field.startswith('_padding')}
@@ -183,7 +183,7 @@ def _other_fields(name: str, topic: str, t: FloatArray, columns: Columns, known:
                      own_unit=unit)
 
 
-def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[Motion]:
+def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     """Yield gyro and accelerometer of a topic along front, left and up."""
     for source, gyro, acc, rank, words in GYROS:
         if source == topic:
@@ -191,7 +191,7 @@ def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[M
             yield from gyro_of(name, t, rates, forces, TURNED, words, rank)
 
 
-def _speeds(topic: str, t: FloatArray, columns: Columns) -> Motion | None:
+def _speeds(topic: str, t: FloatArray, columns: Columns) -> Series | None:
     """Return the speeds reported by ESCs, or None."""
     found = {k: np.abs(columns[f'esc[{k}].esc_rpm']) for k in range(16)
              if np.any(columns.get(f'esc[{k}].esc_rpm', 0.0))}

@@ -25,8 +25,8 @@ def test_values_and_stamps(tmp_path, version, unit):
     np.testing.assert_allclose(found['estTDOA.x'].t,
                                unit * (900 + 2000 * np.arange(0, 300, 7)), atol=1e-9)
     gyro, = log.inertial
-    np.testing.assert_allclose(gyro.vectors['angular_velocity'], np.radians(table[:, 5:8]))
-    np.testing.assert_allclose(gyro.vectors['linear_acceleration'], 9.80665 * table[:, 8:11])
+    np.testing.assert_allclose(gyro.values[:, :3], np.radians(table[:, 5:8]))
+    np.testing.assert_allclose(gyro.values[:, 3:], 9.80665 * table[:, 8:11])
     assert (found['gyro.x'].unit, found['acc.z'].unit, found['pm.state'].unit) == (
         'rad/s', 'm/s^2', '?')
 

@@ -7,9 +7,8 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import (
-    choose_extras, clean_motion, pace_notes, topic_of)
-from ou_monitor.recordings.importers.log import (
-    FORCE, gyro_of, Log, RATE, Series, VELOCITY)
+    choose_extras, pace_notes, topic_of)
+from ou_monitor.recordings.importers.log import clean, gyro_of, Log, Series
 from ou_monitor.recordings.read import read_signal
 import pytest
 
@@ -42,11 +41,11 @@ def test_blackbox_is_scaled_by_its_header(tmp_path, headers, gyro, force):
     rows, moving = frames()
     path, log = load(tmp_path, blackbox(rows, FIELDS, {**HEADERS, **headers}))
     one = choose_extras(path, log).imu
-    np.testing.assert_allclose(one.vectors[RATE], moving[:, :3] * gyro, rtol=1e-4)
+    np.testing.assert_allclose(one.values[:, :3], moving[:, :3] * gyro, rtol=1e-4)
     if force is None:
-        assert FORCE not in one.vectors and any('acc_1G' in note for note in log.notes)
+        assert one.values.shape[1] == 3 and any('acc_1G' in note for note in log.notes)
     else:
-        np.testing.assert_allclose(one.vectors[FORCE], moving[:, 3:6] * force, rtol=1e-12)
+        np.testing.assert_allclose(one.values[:, 3:], moving[:, 3:6] * force, rtol=1e-12)
 
 
 def test_a_gyro_without_scale_is_left_out(tmp_path):
@@ -70,7 +69,7 @@ def test_debug_fields_are_a_gyro_only_where_they_are(tmp_path, firmware, mode, s
     assert ('debug' in [one.name for one in log.inertial]) == shown
     if shown:
         one = choose_extras(path, log, imu='debug').imu
-        np.testing.assert_allclose(one.vectors[RATE], moving[:, 6:9] * DEGREE, rtol=1e-12)
+        np.testing.assert_allclose(one.values[:, :3], moving[:, 6:9] * DEGREE, rtol=1e-12)
 
 
 def test_erpm_needs_the_poles(tmp_path):
@@ -78,13 +77,13 @@ def test_erpm_needs_the_poles(tmp_path):
     rows, moving = frames(100)
     speed = moving[:, 10:12] * 100.0 / 60.0 * 2.0 * np.pi
     _, log = load(tmp_path, blackbox(rows, FIELDS, HEADERS))
-    np.testing.assert_allclose(log.speeds.vectors[VELOCITY], speed / 6.0, rtol=1e-12)
-    assert log.speeds.motors == ('motor_0', 'motor_1') and '12 poles' in log.speeds.words
+    np.testing.assert_allclose(log.speeds.values, speed / 6.0, rtol=1e-12)
+    assert log.speeds.name == 'motor_0, motor_1' and '12 poles' in log.speeds.words
     content = blackbox(rows, FIELDS, {**HEADERS, 'motor_poles': None})
     _, log = load(tmp_path, content)
     assert log.speeds is None and any('--poles' in note for note in log.notes)
     _, log = load(tmp_path, content, poles=14)
-    np.testing.assert_allclose(log.speeds.vectors[VELOCITY], speed / 7.0, rtol=1e-12)
+    np.testing.assert_allclose(log.speeds.values, speed / 7.0, rtol=1e-12)
 
 
 COMBINED = [('uint64_t', 'timestamp'), ('float[3]', 'gyro_rad'),
@@ -103,11 +102,11 @@ def test_ulog_is_turned_to_base_link(tmp_path):
     path, log = load(tmp_path, ulog(topics), 'a.ulg')
     chosen = choose_extras(path, log)
     one = chosen.imu
-    np.testing.assert_allclose(one.vectors[RATE], values[:, :3] * [1, -1, -1], rtol=1e-6)
-    np.testing.assert_allclose(one.vectors[FORCE], values[:, 3:] * [1, -1, -1], rtol=1e-6)
+    np.testing.assert_allclose(one.values[:, :3], values[:, :3] * [1, -1, -1], rtol=1e-6)
+    np.testing.assert_allclose(one.values[:, 3:], values[:, 3:] * [1, -1, -1], rtol=1e-6)
     assert any('sensor_gyro[1]' in note for note in chosen.notes)
     other = choose_extras(path, log, imu='sensor_gyro[1]').imu
-    assert FORCE not in other.vectors
+    assert other.values.shape[1] == 3
     found = named(log)
     assert found['sensor_combined[0].gyro_rad[1]'].unit == 'rad/s'
     assert found['sensor_combined[0].accelerometer_m_s2[2]'].unit == 'm/s^2'
@@ -128,15 +127,15 @@ def test_dataflash_states_units_and_holds_escs(tmp_path):
             log_file.put('ESC', at + 3_000 * instance, instance, 600.0 * (1 + instance) + k)
     path, log = load(tmp_path, log_file.binary, 'a.bin')
     extras = choose_extras(path, log, imu='IMU[1]', signals=['IMU[1].GyrZ'])
-    np.testing.assert_allclose(choose_extras(path, log).imu.vectors[FORCE],
+    np.testing.assert_allclose(choose_extras(path, log).imu.values[:, 3:],
                                values[0, :, 3:] * [1, -1, -1], rtol=1e-6)
-    np.testing.assert_allclose(extras.imu.vectors[RATE],
+    np.testing.assert_allclose(extras.imu.values[:, :3],
                                values[1, :, :3] * [1, -1, -1], rtol=1e-6)
     series = extras.signals['IMU_1/GyrZ']
     np.testing.assert_allclose(series.values, values[1, :, 2], rtol=1e-6)
     assert series.unit == 'rad/s'
     # The second reports 3 ms later: its last report holds.
-    rpm = log.speeds.vectors[VELOCITY] * 30.0 / np.pi
+    rpm = log.speeds.values * 30.0 / np.pi
     np.testing.assert_allclose(rpm[5], [605.0, 1204.0], rtol=1e-6)
 
 
@@ -195,8 +194,8 @@ def test_bad_rows_gaps_and_jumps_of_rate():
     t = np.concatenate([np.arange(100) * 0.001, 0.5 + np.arange(100) * 0.004])
     gyro = np.ones((200, 3))
     gyro[5, 1], t[50] = np.nan, 0.02
-    one, notes = clean_motion(next(gyro_of('g', t, gyro, None, '1', '')))
-    assert one.t.size == 198 and FORCE not in one.vectors and (np.diff(one.t) > 0.0).all()
+    one, notes = clean(next(gyro_of('g', t, gyro, None, '1', '')))
+    assert one.values.shape == (198, 3) and (np.diff(one.t) > 0.0).all()
     assert any('1 sample dropped: not a finite' in note for note in notes)
     notes = pace_notes(one.t)
     assert any('1 gap of up to 0.401 s' in note for note in notes)
