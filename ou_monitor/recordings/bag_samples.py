@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -181,14 +182,12 @@ _SCALARS = (FLOAT32, FLOAT64)
 
 
 def read_bag(
-    path: Path, *, partial: bool, msg_config: str | Path | None, voltage_topic: str | None,
-    throttle_topic: str | None, start: float | None, end: float | None,
-    progress: Callable[[float], None] | None,
+    path: Path, *, partial: bool, start: float | None, end: float | None,
+    progress: Callable[[float], None] | None, **of_bags: Any,
 ) -> RawColumns:
     """Read voltage, throttle and current of a bag, start and end in s; see `read_recording`."""
     bag = BagReader(path, partial=partial)
-    choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
-                    throttle_topic=throttle_topic)
+    choice = choose(bag.path, bag.topics, **of_bags)
     specs = dict(choice.specs)
     stated = bag.sample_rates.get(specs[VOLTAGE].topic)
     if specs[VOLTAGE].sample_rate is not None and stated is not None:
@@ -238,9 +237,9 @@ def read_bag(
                           Defect.GAPS))
     log_time, ends, stamped = supply.log_time, t, supply.stamped
     if clock is not None:
-        some = supply.counts > 0
-        log_time, stamped = log_time[some], stamped[some]
-        ends = t[(np.cumsum(supply.counts) - 1)[some]]
+        filled = supply.counts > 0
+        log_time, stamped = log_time[filled], stamped[filled]
+        ends = t[(np.cumsum(supply.counts) - 1)[filled]]
     holds: dict[str, ThrottleHold] = {}
     for which, column in columns.items():
         holds[which], unknown = _hold_of(column, specs[which], first, log_time, ends, stamped,

@@ -310,7 +310,8 @@ class McapFile:
                         self._learn(op, self._content(file, length, self._limit))
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
-                elif op in _UNREAD and statistics is None and not self._behind_chunk():
+                elif op in _UNREAD and statistics is None and not (
+                        self.spans and self.spans[-1].chunk):
                     # Without a count of messages, check that a damaged opcode hides none.
                     _parse(_UNREAD[op], self._content(file, length, self._limit))
                 elif op >= _PRIVATE and statistics is None and not private:
@@ -363,12 +364,6 @@ class McapFile:
             self._schemas[found.id] = found
         else:
             self._add_channel(found)
-
-    def _learn_all(self, data: bytes, others: Sequence[tuple[int, int, int]]) -> None:
-        """Take the schemas and channels of a chunk."""
-        for op, begin, end in others:
-            if op in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._learn(op, data[begin:end])
 
     def _learn_about(self, file: BinaryIO, length: int) -> None:
         """Read the metadata record whose head was just read; the first broken one is noted."""
@@ -439,11 +434,10 @@ class McapFile:
             if self._unpacked > self._limit_of_all:
                 raise Damage(_over_limit('it and those before it hold', self._unpacked,
                                          self._limit_of_all))
-            places, others = _all_records(data)
-            self._learn_all(data, others)
+            table = self._messages(data)
         except Damage as error:
             raise Damage(f'the chunk there is broken ({error})') from error
-        self._add_span(_table(data, places), span._replace(unpacked=len(data)))
+        self._add_span(table, span._replace(unpacked=len(data)))
 
     def _walk_messages(self, file: BinaryIO, at: int, end: int) -> int:
         """Count messages outside of chunks, the first from `at` to `end`; return their end."""
@@ -456,10 +450,6 @@ class McapFile:
             raise Damage('a message is shorter than its own head')
         self._add_span(_table(data, places), Span(0, 0, at, length, False))
         return at + length
-
-    def _behind_chunk(self) -> bool:
-        """Return whether the last messages were in a chunk."""
-        return bool(self.spans) and self.spans[-1].chunk
 
     def _add_span(self, table: MessageTable, span: Span) -> None:
         """Add the messages of a span to the index."""
@@ -504,6 +494,16 @@ class McapFile:
             raise Damage('its checksum is wrong')
         return data
 
+    def _messages(self, data: bytes, index: bytes = b'') -> MessageTable:
+        """Return the messages of a chunk; register its schemas and channels."""
+        places, others, reached = _by_index(data, index) or _records(data)
+        if reached < len(data):
+            raise Damage('a record within it is cut off')
+        for op, begin, end in others:
+            if op in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(op, data[begin:end])
+        return _table(data, places)
+
     def channels_of(self, wanted: set[str]) -> dict[int, str]:
         """Return channel -> topic of some topics."""
         return {key: topic.name for key, topic in self.topics.items() if topic.name in wanted}
@@ -522,18 +522,16 @@ class McapFile:
         return {name: table.where(mine) for name, mine in topics.items()}
 
     def _table_of(self, file: BinaryIO, span: Span) -> MessageTable:
-        """Return the messages of a span; register its schemas and channels."""
+        """Return the messages of a span."""
         try:
             data = self._data(file, span)
             file.seek(span.offset + span.length)
             # Longest index: 15 bytes per channel and 16 per message (of 31 bytes or more).
             index = file.read(min(span.index_length, len(data) + 15 * 65536))
-            places, others = _by_index(data, index) or _all_records(data)
-            table = _table(data, places)
+            table = self._messages(data, index)
             if span.unpacked and ((table.log_time < span.start_ns)
                                   | (table.log_time > span.end_ns)).any():
                 raise Damage('its messages do not have the times of its index')
-            self._learn_all(data, others)
         except Damage as error:
             raise InputError(
                 f'{self.path} is damaged at byte {span.offset - _HEAD.size}: the chunk there '
@@ -661,15 +659,7 @@ def _records(data: bytes, at: int = 0, *, end: int | None = None, messages_only:
     return np.frombuffer(places, np.int64) if places else np.empty(0, np.int64), others, at
 
 
-def _all_records(data: bytes) -> tuple[IntArray, Others]:
-    """Return the records of a chunk as `_records` does."""
-    places, others, reached = _records(data)
-    if reached < len(data):
-        raise Damage('a record within it is cut off')
-    return places, others
-
-
-def _by_index(data: bytes, index: bytes) -> tuple[IntArray, Others] | None:
+def _by_index(data: bytes, index: bytes) -> tuple[IntArray, Others, int] | None:
     """Return the records of a chunk as `_records`; None if its indexes do not describe them."""
     # Messages in the indexes and records of other kinds must fill the chunk from end to end.
     parts, at = [np.empty(0, np.int64)], 0
@@ -698,7 +688,7 @@ def _by_index(data: bytes, index: bytes) -> tuple[IntArray, Others] | None:
         if end != ahead[gap] or inside.size:
             return None
         others += more
-    return places, others
+    return places, others, len(data)
 
 
 def _table(data: bytes, at: IntArray) -> MessageTable:

@@ -88,18 +88,18 @@ def read_recording(
 
 
 def _read(
-    path: Path, signal: str | None = None, *, msg_config: str | Path | None = None,
-    voltage_topic: str | None = None, throttle_topic: str | None = None, partial: bool = False,
+    path: Path, signal: str | None = None, *, partial: bool = False,
     start: float | None = None, end: float | None = None, flight: int | None = None,
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
+    **of_bags: Any,
 ) -> tuple[Recording, Log | None]:
     """Read a recording, repeats included; of a log, return also the `Log`, with `signal`."""
     _check_part(start, end)
     csv, log = is_csv(path), is_log(path)
-    for option, value in (('msg-config', msg_config), ('voltage-topic', voltage_topic),
-                          ('throttle-topic', throttle_topic)):
+    for option, value in of_bags.items():
         if (csv or log) and value is not None:
-            raise InputError(f"{path} is a {'CSV' if csv else 'log'}: --{option} is for bags")
+            raise InputError(f"{path} is a {'CSV' if csv else 'log'}: "
+                             f"--{option.replace('_', '-')} is for bags")
     if csv:
         if flight is not None:
             raise InputError(f'{path} is a CSV: --flight is for logs')
@@ -113,9 +113,8 @@ def _read(
     # Imported here, because a CSV or a log needs none of the modules that read bags.
     from ou_monitor.recordings.bag_samples import read_bag
 
-    return tidy(read_bag(
-        path, partial=partial, msg_config=msg_config, voltage_topic=voltage_topic,
-        throttle_topic=throttle_topic, start=start, end=end, progress=progress)), None
+    return tidy(read_bag(path, partial=partial, start=start, end=end, progress=progress,
+                         **of_bags)), None
 
 
 def _read_log(path: Path, signal: str | None, columns: CsvColumns | None, flight: int | None,

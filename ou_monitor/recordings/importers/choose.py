@@ -232,7 +232,7 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None,
         speeds = speeds if speeds.n else None
     named: dict[str, Series] = {}
     for name in dict.fromkeys(signals):
-        series, said = _cleaned(path, name, named_series(path, log, name))
+        series, said = signal_of(path, log, name)
         notes += said
         if series.unit == UNKNOWN:
             notes.append(f'{name}: the log does not state its unit; written as it is logged.')
@@ -246,28 +246,17 @@ def default_gyro(log: Log) -> Series | None:
                key=lambda one: one.rank or 0, default=None)
 
 
-def named_series(path: Path, log: Log, name: str) -> Series:
-    """Return a series of a log by its name."""
-    for one in log.series:
-        if one.name == name:
-            return one
-    known = list(dict.fromkeys([*log.names, *(one.name for one in log.series)]))
-    hint = nearest(name, known) if known else 'it holds none'
-    if hint.startswith('valid:'):
-        hint = _LIST
-    raise InputError(f"{path} has no series '{name}': {hint}")
-
-
-def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...]]:
-    """Return a series by its name, and notes on it."""
-    if not signal:
+def signal_of(path: Path, log: Log, name: str) -> tuple[Series, tuple[str, ...]]:
+    """Return the usable samples of a series by its name, and notes on it."""
+    if not name:
         raise InputError('the name of the signal is empty: ' + _LIST)
-    return _cleaned(path, signal, named_series(path, log, signal))
-
-
-def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, ...]]:
-    """Return the usable samples of a series, and notes on it."""
-    series, said = clean(series)
+    found = next((one for one in log.series if one.name == name), None)
+    if found is None:
+        known = list(dict.fromkeys([*log.names, *(one.name for one in log.series)]))
+        hint = nearest(name, known) if known else 'it holds none'
+        raise InputError(f"{path} has no series '{name}': "
+                         + (_LIST if hint.startswith('valid:') else hint))
+    series, said = clean(found)
     if not series.n:
         raise InputError(f'{path}: {name} has no usable sample'
                          + ''.join(f' ({sentence})' for sentence in said))

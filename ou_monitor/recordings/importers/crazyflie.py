@@ -24,7 +24,7 @@ from zlib import crc32
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, one_flight, Request, Series, SIGNAL,
+    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Request, Series, SIGNAL,
     three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
@@ -62,7 +62,6 @@ class _Event(NamedTuple):
 
 def read(path: Path, request: Request) -> Log:
     """Read a log."""
-    one_flight(path, request)
     with open_regular(path) as file:
         data = file.read()
     version, number = struct.unpack_from('<HH', data, 1)

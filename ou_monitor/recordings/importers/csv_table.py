@@ -28,7 +28,7 @@ from ou_monitor.recordings.importers.csv_cells import (
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
-    ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
+    ANY, CsvColumns, Log, RawColumns, Request, Series)
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
@@ -106,7 +106,7 @@ _PATTERNS = {
 # Betaflight's blackbox explorer: us, 0.01 V and 0.01 A, as logged from version 4.0 on.  MAVLink:
 # SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml).
 _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
-    'loopIteration': {'time': (1e-6, 'us', math.nan), 'rccommand[3]': (0.0, 'us', math.nan), **{
+    'loopIteration': {'time': (0.0, 'us', math.nan), 'rccommand[3]': (0.0, 'us', math.nan), **{
         f'{name}{end}': (0.01, unit, math.nan) for name, unit in (
             ('vbat', '0.01 V'), ('amperage', '0.01 A')) for end in ('', 'latest')}},
     '': {name: (scale, f'{unit} by MAVLink, {unknown:g} is unknown: --unit V for V and A', unknown)
@@ -181,7 +181,6 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
 
 def read(path: Path, request: Request) -> Log:
     """Read the columns of a supply, and the requested ones."""
-    one_flight(path, request)
     table = _table(path, request.columns or CsvColumns(), more=request.names)
     header, t = [name for name in table.form.names if name], table.t
     if not t.size:
@@ -646,8 +645,6 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
         return t, f'{time.scale:g} s'
     if _holds_clocks(form, time.place[0]):
         return t, 'dates and times'
-    if time.scale:
-        return t * time.scale, time.unit
     known = t[np.isfinite(t)]
     steps = np.abs(np.diff(known))
     usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0

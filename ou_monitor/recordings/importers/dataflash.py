@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, one_flight, quiet_process, Request,
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, quiet_process, Request,
     RPM, Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
@@ -74,7 +74,6 @@ Table = dict[tuple[str, str], Columns]
 
 def read(path: Path, request: Request) -> Log:
     """Read a dataflash log, binary or text."""
-    one_flight(path, request)
     with open_regular(path) as file:
         text = not file.read(2).startswith(b'\xa3\x95')
     with _plain_text(path, text) as (name, mended):

@@ -42,6 +42,7 @@ class Format(NamedTuple):
     fits: Callable[[bytes], bool]  # Whether a file with these first bytes has this format
     module: str  # Name of the module that reads it, beside this one; empty: not a log
     package: str = ''  # Package needed beyond the core; an extra of the module's name installs it
+    several: bool = False  # Whether a file may hold several flights
 
 
 def is_text(head: bytes) -> bool:
@@ -71,7 +72,7 @@ FORMATS = (
            lambda head: is_text(head) and (head.startswith(b'FMT,') or b'\nFMT,' in head),
            'dataflash', 'pymavlink'),
     Format('blackbox', 'Betaflight or INAV blackbox (.bbl, .bfl)',
-           lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox'),
+           lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox', True),
     Format('crazyflie', 'Crazyflie micro-SD log', _is_crazyflie, 'crazyflie'),
     Format(CSV, 'CSV (.csv, .txt, .tsv)', is_text, 'csv_table'),
 )
@@ -171,6 +172,8 @@ def import_log(path: Path, request: Request) -> Log:
     form = detect(path)
     if form.name == BAG:
         raise InputError(f"'{path}' is an MCAP bag already: analyze, discover and replay take it")
+    if not form.several and request.flight not in (None, 1):
+        raise InputError(f'{path} holds one flight, so --flight {request.flight} does not exist')
     try:
         module = import_module(f'{__package__}.{form.module}')
     except ImportError as error:

@@ -178,12 +178,6 @@ class Request:
     columns: CsvColumns | None = None  # How a CSV is to be read
 
 
-def one_flight(path: Path, request: Request) -> None:
-    """Refuse a flight other than the first, for formats with one flight per file."""
-    if request.flight not in (None, 1):
-        raise InputError(f'{path} holds one flight, so --flight {request.flight} does not exist')
-
-
 def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
     """Select samples as `in_order` does, but leave out stamps from corrupt bytes."""
     notes: list[str] = []

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, one_flight, Progress, quiet, Request, RPM,
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Progress, quiet, Request, RPM,
     Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
@@ -114,7 +114,6 @@ class _WatchedFile(io.BufferedReader):
 
 def read(path: Path, request: Request) -> Log:
     """Read a ULog."""
-    one_flight(path, request)
     size = path.stat().st_size
     with quiet(path, 'pyulog') as said:
         with _WatchedFile(io.FileIO(path)) as file:
