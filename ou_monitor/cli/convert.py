@@ -36,7 +36,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
 
     chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
                     current=args.current)
-    extras = choose_extras(args.log, log, imu=args.imu, signals=args.signal)
+    extras, said = choose_extras(args.log, log, imu=args.imu, signals=args.signal)
     about = {'log_file': args.log.name, 'log_format': log.format,
              'log_time': 'as in the file, s' if log.format == 'csv' else
              's from the start of the log',
@@ -44,7 +44,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     with Progress('writing', args.json == output.STDOUT) as progress, \
             output.replacing(args.out, args.force):
         topics, moved = write_log(chosen, extras, args.out, about, progress=progress)
-    notes = (*log.notes, *chosen.notes, *extras.notes, *moved)
+    notes = (*log.notes, *chosen.notes, *said, *moved)
     volts = chosen.voltage
     duration = float(volts.t[-1] - volts.t[0])
     taken = _topic_contents(chosen, extras)
@@ -61,9 +61,9 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     return 0
 
 
-def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
+def _topic_contents(chosen: Any, extras: dict[str, Any]) -> dict[str, dict[str, Any]]:
     found = {'voltage': chosen.voltage, 'throttle': chosen.throttle, 'current': chosen.current,
-             **extras.signals, 'imu': extras.imu, 'motor_speed': extras.speeds}
+             **extras}
     return {f'/{topic}': {'field': one.name, 'scale': one.scale, 'what': one.words,
                           'unit': one.unit, 'n': one.n}
             for topic, one in found.items() if one is not None}

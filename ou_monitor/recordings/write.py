@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.importers.choose import ChosenSeries, Extras
+from ou_monitor.recordings.importers.choose import ChosenSeries
 from ou_monitor.recordings.importers.log import Series, SPEEDS
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_blocks, encode_imu, encode_joints, encode_scalars,
@@ -32,6 +32,10 @@ TYPES = {
     'battery_state': BATTERY_STATE, 'float32': FLOAT32, 'float64': FLOAT64,
     'adc_block': FLOAT32_ARRAY,
 }
+
+# Topic of a log -> message type; of a named series FLOAT64.
+_KINDS = {'voltage': BATTERY_STATE, 'throttle': FLOAT32, 'current': FLOAT32, 'imu': IMU,
+          SPEEDS: JOINT_STATE}
 
 # Maximum samples encoded at once, which limits memory; a multiple of BLOCK.
 SLICE = 1000
@@ -163,17 +167,15 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
 
 
 def write_log(
-    chosen: ChosenSeries, extras: Extras, path: Path, about: Mapping[str, str], *,
+    chosen: ChosenSeries, extras: Mapping[str, Series], path: Path, about: Mapping[str, str], *,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Write a bag (progress 0..1)."""
+    """Write a bag (extras: by topic; progress 0..1)."""
     # At equal times the voltage comes last, after the values that hold for it.
-    held: dict[str, Series | None] = {
-        'throttle': chosen.throttle, 'current': chosen.current, 'imu': extras.imu,
-        SPEEDS: extras.speeds, **extras.signals, 'voltage': chosen.voltage}
+    held = {'throttle': chosen.throttle, 'current': chosen.current, **extras,
+            'voltage': chosen.voltage}
     streams = {topic: one for topic, one in held.items() if one is not None}
-    kinds = {'throttle': FLOAT32, 'current': FLOAT32, 'imu': IMU, SPEEDS: JOINT_STATE,
-             **dict.fromkeys(extras.signals, FLOAT64), 'voltage': BATTERY_STATE}
+    kinds = {topic: _KINDS.get(topic, FLOAT64) for topic in streams}
     first = min(float(one.t[0]) for one in streams.values())
     shift = max(0, -round(first * 1e9))
     total = sum(one.t.size for one in streams.values())

@@ -199,45 +199,36 @@ _PARTS, _UNEQUAL = 10, 1.5
 _GAP = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Extras:
-    """Series chosen from a log beside voltage, throttle and current."""
-
-    imu: Series | None  # Gyro, with its accelerometer
-    speeds: Series | None  # Speeds of the motors
-    signals: dict[str, Series]  # By topic, without the slash
-    notes: tuple[str, ...]  # Dropped samples, and quantities missing in the log
-
-
-def choose_extras(path: Path, log: Log, *, imu: str | None = None,
-                  signals: Sequence[str] = ()) -> Extras:
-    """Choose the named or the default gyro, and the named series."""
+def choose_extras(path: Path, log: Log, *, imu: str | None = None, signals: Sequence[str] = (),
+                  ) -> tuple[dict[str, Series], tuple[str, ...]]:
+    """Return, by topic, the named or the default gyro, the speeds and the named series; notes."""
     notes: list[str] = []
+    found: dict[str, Series] = {}
     gyro = _gyro(path, log, imu)
     if gyro is not None:
         gyro, said = clean(gyro)
         notes += prefixed(gyro.name, (*said, *pace_notes(gyro.t)))
-        if not gyro.n:
+        if gyro.n:
+            found[IMU] = gyro
+        else:
             notes.append(f'{gyro.name} has no usable sample.')
-            gyro = None
-    if gyro is None and imu != NONE and log.format != 'csv':
+    if IMU not in found and imu != NONE and log.format != 'csv':
         notes.append('The log holds no gyro, so there is no topic /imu.')
-    others = [one.name for one in log.inertial if gyro is None or one.name != gyro.name]
+    others = [one.name for one in log.inertial if IMU not in found or one.name != found[IMU].name]
     if others:
         notes.append(f"Also in the log: {', '.join(others)} (--imu NAME).")
-    speeds = log.speeds
-    if speeds is not None:
-        speeds, said = clean(speeds)
+    if log.speeds is not None:
+        speeds, said = clean(log.speeds)
         notes += prefixed(SPEEDS, said)
-        speeds = speeds if speeds.n else None
-    named: dict[str, Series] = {}
+        if speeds.n:
+            found[SPEEDS] = speeds
     for name in dict.fromkeys(signals):
         series, said = signal_of(path, log, name)
         notes += said
         if series.unit == UNKNOWN:
             notes.append(f'{name}: the log does not state its unit; written as it is logged.')
-        named[_unused_topic(topic_of(name), {*_TAKEN, *named})] = series
-    return Extras(gyro, speeds, named, tuple(notes))
+        found[_unused_topic(topic_of(name), {*_TAKEN, *found})] = series
+    return found, tuple(notes)
 
 
 def default_gyro(log: Log) -> Series | None:

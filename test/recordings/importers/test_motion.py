@@ -40,7 +40,7 @@ def test_blackbox_is_scaled_by_its_header(tmp_path, headers, gyro, force):
     """Gyro in rad/s and acceleration in m/s^2; series without a scale are left out with a note."""
     rows, moving = frames()
     path, log = load(tmp_path, blackbox(rows, FIELDS, {**HEADERS, **headers}))
-    one = choose_extras(path, log).imu
+    one = choose_extras(path, log)[0]['imu']
     np.testing.assert_allclose(one.values[:, :3], moving[:, :3] * gyro, rtol=1e-4)
     if force is None:
         assert one.values.shape[1] == 3 and any('acc_1G' in note for note in log.notes)
@@ -53,7 +53,7 @@ def test_a_gyro_without_scale_is_left_out(tmp_path):
     path, log = load(tmp_path, blackbox(rows, FIELDS, {**HEADERS, 'gyro_scale': None,
                                                        'debug_mode': '3'}))
     assert log.inertial == () and any('gyro_scale' in note for note in log.notes)
-    assert any('no topic /imu' in note for note in choose_extras(path, log).notes)
+    assert any('no topic /imu' in note for note in choose_extras(path, log)[1])
     found = named(log)
     assert found['gyroADC[0]'].unit == '?'
 
@@ -68,7 +68,7 @@ def test_debug_fields_are_a_gyro_only_where_they_are(tmp_path, firmware, mode, s
     path, log = load(tmp_path, blackbox(rows, FIELDS, headers))
     assert ('debug' in [one.name for one in log.inertial]) == shown
     if shown:
-        one = choose_extras(path, log, imu='debug').imu
+        one = choose_extras(path, log, imu='debug')[0]['imu']
         np.testing.assert_allclose(one.values[:, :3], moving[:, 6:9] * DEGREE, rtol=1e-12)
 
 
@@ -100,12 +100,12 @@ def test_ulog_is_turned_to_base_link(tmp_path):
                                    ('float', 'z')],
                 [(int(a), *b[:3]) for a, b in zip(t, values)])]
     path, log = load(tmp_path, ulog(topics), 'a.ulg')
-    chosen = choose_extras(path, log)
-    one = chosen.imu
+    chosen, notes = choose_extras(path, log)
+    one = chosen['imu']
     np.testing.assert_allclose(one.values[:, :3], values[:, :3] * [1, -1, -1], rtol=1e-6)
     np.testing.assert_allclose(one.values[:, 3:], values[:, 3:] * [1, -1, -1], rtol=1e-6)
-    assert any('sensor_gyro[1]' in note for note in chosen.notes)
-    other = choose_extras(path, log, imu='sensor_gyro[1]').imu
+    assert any('sensor_gyro[1]' in note for note in notes)
+    other = choose_extras(path, log, imu='sensor_gyro[1]')[0]['imu']
     assert other.values.shape[1] == 3
     found = named(log)
     assert found['sensor_combined[0].gyro_rad[1]'].unit == 'rad/s'
@@ -126,12 +126,12 @@ def test_dataflash_states_units_and_holds_escs(tmp_path):
             log_file.put('IMU', at, instance, *values[instance, k])
             log_file.put('ESC', at + 3_000 * instance, instance, 600.0 * (1 + instance) + k)
     path, log = load(tmp_path, log_file.binary, 'a.bin')
-    extras = choose_extras(path, log, imu='IMU[1]', signals=['IMU[1].GyrZ'])
-    np.testing.assert_allclose(choose_extras(path, log).imu.values[:, 3:],
+    extras, _ = choose_extras(path, log, imu='IMU[1]', signals=['IMU[1].GyrZ'])
+    np.testing.assert_allclose(choose_extras(path, log)[0]['imu'].values[:, 3:],
                                values[0, :, 3:] * [1, -1, -1], rtol=1e-6)
-    np.testing.assert_allclose(extras.imu.values[:, :3],
+    np.testing.assert_allclose(extras['imu'].values[:, :3],
                                values[1, :, :3] * [1, -1, -1], rtol=1e-6)
-    series = extras.signals['IMU_1/GyrZ']
+    series = extras['IMU_1/GyrZ']
     np.testing.assert_allclose(series.values, values[1, :, 2], rtol=1e-6)
     assert series.unit == 'rad/s'
     # The second reports 3 ms later: its last report holds.
@@ -214,7 +214,7 @@ def test_a_signal_never_takes_an_existing_topic(tmp_path):
     """A column called throttle is written beside the throttle."""
     t = np.arange(3.0)
     log = Log('csv', tuple(Series(name, 'any', t, t, '1') for name in ('throttle', 'a.b', 'a/b')))
-    found = choose_extras(tmp_path, log, signals=['throttle', 'a.b', 'a/b'])
-    assert [*found.signals] == ['signal/throttle', 'a/b', 'a_b']
+    found, _ = choose_extras(tmp_path, log, signals=['throttle', 'a.b', 'a/b'])
+    assert [*found] == ['signal/throttle', 'a/b', 'a_b']
     with pytest.raises(InputError, match='has no series'):
         choose_extras(tmp_path, log, signals=['c'])
