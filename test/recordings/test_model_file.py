@@ -156,29 +156,3 @@ def test_a_wrong_term_is_named_with_the_nearest_word(entry, words):
 def test_a_malformed_model_file_is_refused(data, words):
     """Keys that are missing, misspelt, out of order or repeated are refused too."""
     assert words in failure(data)
-
-
-@pytest.mark.parametrize('content, words', [
-    (b'', "needs 'model:'"), (b'\n# only a comment\n', "needs 'model:'"),
-    (b'model: [\n  b: }\n', 'is not YAML'), (b'model:\n\t- term: ou\n', 'is not YAML'),
-    (bytes(range(256)) * 8, 'is not YAML'), (b'\x00\x01\x02', 'is not YAML'),
-    (b'model: !!python/object/apply:os.getcwd []\n', 'is not YAML'),
-    (b'model: []\nprovenance: {date: 2026-99-99}\n', 'is not YAML'),
-    (b'[' * 20_000, 'nested more than 64 deep'), (b'a: 1\n---\nb: 2\n', 'is not YAML'),
-    (b'model: &a [*a]\n', 'an alias contains itself'),
-], ids=['empty', 'comment', 'syntax', 'tab', 'binary', 'nul', 'python', 'date', 'deep', 'two',
-        'loop'])
-def test_files_of_other_kinds_are_refused(tmp_path, content, words):
-    path = tmp_path / 'bad.yaml'
-    path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        read_model(path)
-    text = str(caught.value)
-    assert str(path) in text and words in text and '\n' not in text
-
-
-def test_unreadable_files_are_refused(tmp_path):
-    for path in (tmp_path / 'none.yaml', tmp_path):
-        with pytest.raises(InputError, match='cannot read the model file') as caught:
-            read_model(path)
-        assert str(path) in str(caught.value)

@@ -42,6 +42,7 @@ BAD = {
     'escape': '"\\x1b[31m', 'control': f'{SECRET}: \x1b[31m', 'key': f'? [{SECRET}]\n: 1',
     'long_line': f'{SECRET}' * 5000 + ': [', 'duplicate': f'a: &{SECRET} 1\nb: &{SECRET} 2',
     'key_twice': f'{SECRET}: 1\n{SECRET}: 2', 'keys_deep': 'a: [{"b": 1, b: 2}]',
+    'tab': 'a:\n\t- b', 'nul': '\x00\x01', 'call': '!!python/object/apply:os.getcwd []',
     'binary': f'!!binary "é{SECRET}"', 'indicator': f'- >{SECRET}',
 }
 

@@ -51,35 +51,23 @@ def stream_of(voltage_stamp=None, throttle_stamp=None, **voltage):
     return stream, sink
 
 
-def test_pairs_by_stamp_on_one_clock():
-    """The throttle that held at the voltage's stamp, though it came after it."""
-    stream, sink = stream_of('stamp', 'stamp')
-    stream.take_throttle(stamped(0.5, 0.1), None)
-    for k in range(4):
-        stream.take_voltage(stamped(1.0 + k, 5.0), None)
-    stream.take_throttle(stamped(2.5, 0.7), None)
+@pytest.mark.parametrize('throttle_stamp, messages, expected', [
+    # On one clock: the throttle that held at the voltage's stamp, though it came after it.
+    ('stamp', [('u', 0.5, 0.1), *(('v', 1.0 + k, 5.0) for k in range(4)), ('u', 2.5, 0.7)],
+     [0.1, 0.1, 0.7, 0.7]),
+    # A source time may lie off a driver's stamps by less than two clocks usually do.
+    (None, [('v', 1.0, 5.0), ('u', 0.5, 0.3), ('v', 2.0, 5.0), ('u', 1.5, 0.4)], [math.nan, 0.3]),
+    (None, [*(('v', 1.0 + 0.01 * k, 5.0) for k in range(4)), ('u', 1.015, 0.3)],
+     [math.nan, math.nan, 0.3, 0.3]),
+    # The clocks differ: by arrival.
+    ('stamp', [('u', 12.0, 0.2), ('v', 1.7e9, 5.0)], [0.2])])
+def test_throttle_is_paired_by_stamp_or_by_arrival(throttle_stamp, messages, expected):
+    stream, sink = stream_of('stamp', throttle_stamp)
+    for which, stamp, value in messages:
+        take = stream.take_throttle if which == 'u' else stream.take_voltage
+        take(stamped(stamp, value), lambda at=stamp: at)
     stream.flush()
-    assert sink.u == [0.1, 0.1, 0.7, 0.7]
-
-
-def test_pairs_by_arrival_when_only_one_is_stamped():
-    """A source time may lie off a driver's stamps by less than two clocks usually do."""
-    stream, sink = stream_of('stamp', None)
-    stream.take_voltage(stamped(1.0, 5.0), None)
-    stream.take_throttle(plain(0.3), lambda: 0.5)
-    stream.take_voltage(stamped(2.0, 5.0), None)
-    stream.take_throttle(plain(0.4), lambda: 1.5)
-    stream.flush()
-    assert math.isnan(sink.u[0]) and sink.u[1] == 0.3
-
-
-def test_pairs_by_stamp_when_only_one_is_stamped_and_the_clocks_agree():
-    stream, sink = stream_of('stamp', None)
-    for k in range(4):
-        stream.take_voltage(stamped(1.0 + 0.01 * k, 5.0), None)
-    stream.take_throttle(plain(0.3), lambda: 1.015)
-    stream.flush()
-    np.testing.assert_array_equal(sink.u, [math.nan, math.nan, 0.3, 0.3])
+    np.testing.assert_array_equal(sink.u, expected)
 
 
 def test_memory_for_throttle_without_voltage_is_bounded():
@@ -105,14 +93,6 @@ def test_backward_throttle_restarts_the_pairing():
     stream.take_voltage(stamped(4.03, 5.0), None)
     stream.flush()
     assert sink.u == [0.9, 0.1, 0.2] and len(sink.resets) == 1
-
-
-def test_pairs_by_arrival_when_the_clocks_differ():
-    stream, sink = stream_of('stamp', 'stamp')
-    stream.take_throttle(stamped(12.0, 0.2), None)
-    stream.take_voltage(stamped(1.7e9, 5.0), None)
-    stream.flush()
-    assert sink.u == [0.2]
 
 
 def test_missing_values_go_on_as_nan():
