@@ -348,6 +348,24 @@ FORMS = {
     # Castle: pulses in ms; EdgeTX: the pack beside the receiver.
     'castle': (table(['Seconds,Throttle (ms),Voltage (v),Current (A)'], lambda k: (
         f'{0.1 * k:.1f},{1.0 + U[k]:.3f},{V[k]},{AMPS[k]}')), 0.1, True, True),
+    # Yokogawa: facts end at a blank line and hold the names; GW Instek: they end with a title.
+    'yokogawa': (table(
+        ['"Header Size",15', '"Model Name","DLM3054"', '"Comment",""', '"BlockNumber",1',
+         '"TraceName","U_BAT   ","I_BAT   "', f'"BlockSize",{N},{N}', '"VUnit","V","A"',
+         '"SampleRate",1.0E+03,1.0E+03', '"HResolution",1.0E-03,1.0E-03', '"HUnit","s","s"',
+         f'"DisplayBlockSize",{N},{N}', '"DisplayPointNo.",1,1',
+         '"Date","2024/06/18","2024/06/18"', '"Time","14:22:07.510","14:22:07.510"', ''],
+        lambda k: f', {V[k]:.7E}, {AMPS[k]:.7E}'), 1e-3, False, True),
+    'gwinstek_title': (table(
+        ['Format,1.0B', 'Source,CH1', 'Vertical Units,V', 'Sampling Period,4.000E-04',
+         'Horizontal Old Scale,5.000E-03', 'Mode,Detail', 'Waveform Data'],
+        lambda k: f'{4e-4 * k:.8E},{V[k]:.6f},'), 4e-4, False, False),
+    # Facts, a blank line, names, units, a blank line.
+    'motec': (table(
+        [*(f'"{name}","fact",,' for name in 'Format Venue Vehicle Driver Device Comment'.split()),
+         '"Log Date","28/11/2026",,', '"Log Time","10:38:24",,', '"Rate","50.000","Hz",', '', '',
+         '"Time","Throttle Pos","Battery Voltage","Battery Current"', '"s","%","V","A"', '', ''],
+        lambda k: f'"{0.02 * k:.3f}","{100 * U[k]:.1f}","{V[k]}","{AMPS[k]}"'), 0.02, True, True),
     'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
         f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
 }
@@ -692,28 +710,6 @@ def test_rows_of_outer_tables_are_left_out(tmp_path):
     assert 'without rows of outer tables' in found.notes[0]
 
 
-def test_facts_and_a_title_above_rows_without_names(tmp_path):
-    """Yokogawa's facts end at a blank line and hold the names; GW Instek's end with a title."""
-    path = written(tmp_path, table(
-        ['"Header Size",15', '"Model Name","DLM3054"', '"Comment",""', '"BlockNumber",1',
-         '"TraceName","U_BAT   ","I_BAT   "', f'"BlockSize",{N},{N}', '"VUnit","V","A"',
-         '"SampleRate",1.0E+03,1.0E+03', '"HResolution",1.0E-03,1.0E-03', '"HUnit","s","s"',
-         f'"DisplayBlockSize",{N},{N}', '"DisplayPointNo.",1,1',
-         '"Date","2024/06/18","2024/06/18"', '"Time","14:22:07.510","14:22:07.510"', ''],
-        lambda k: f', {V[k]:.7E}, {AMPS[k]:.7E}'))
-    found = read_recording(path)
-    np.testing.assert_allclose(found.t, 1e-3 * K)
-    np.testing.assert_allclose(found.voltage, V)
-    np.testing.assert_allclose(found.current, AMPS)
-    path = written(tmp_path, table(
-        ['Format,1.0B', 'Source,CH1', 'Vertical Units,V', 'Sampling Period,4.000E-04',
-         'Horizontal Old Scale,5.000E-03', 'Mode,Detail', 'Waveform Data'],
-        lambda k: f'{4e-4 * k:.8E},{V[k]:.6f},'))
-    found = read_recording(path)
-    np.testing.assert_allclose(found.t, 4e-4 * K, atol=1e-12)
-    np.testing.assert_allclose(found.voltage, V)
-
-
 def test_a_late_line_does_not_change_the_time(tmp_path):
     """Another time that only rises is no reason to leave the one that is named best."""
     t = 0.1 * K
@@ -733,18 +729,6 @@ def test_a_time_with_decimals_is_finer_than_a_clock(tmp_path):
     # Without a unit it may be in minutes.
     path = written(tmp_path, path.read_text().replace('Test_Time(s)', 'Test_Time'))
     assert read_recording(path).t[0] > 1e9
-
-
-def test_blank_lines_around_names_and_units(tmp_path):
-    """MoTeC: facts, a blank line, names, units, a blank line."""
-    path = written(tmp_path, table(
-        [*(f'"{name}","fact",,' for name in 'Format Venue Vehicle Driver Device Comment'.split()),
-         '"Log Date","28/11/2026",,', '"Log Time","10:38:24",,', '"Rate","50.000","Hz",', '', '',
-         '"Time","Throttle Pos","Battery Voltage","Battery Current"', '"s","%","V","A"', '', ''],
-        lambda k: f'"{0.02 * k:.3f}","{100 * U[k]:.1f}","{V[k]}","{AMPS[k]}"'))
-    found = read_recording(path)
-    np.testing.assert_allclose(found.throttle, U, atol=1e-3)
-    np.testing.assert_allclose(found.current, AMPS)
 
 
 def test_a_voltage_with_a_current_of_its_name_is_preferred(tmp_path):
