@@ -210,14 +210,11 @@ def _field_spec(content: Any, where: str,
         rule = getattr(spec, key)
         if rule not in rules:
             raise InputError(f"{where}: unknown {key} rule '{rule}': {nearest(rule, rules)}")
-    if spec.sample_rate is not None and spec.sample_rate <= 0.0:
-        raise InputError(
-            f'{where}: sample_rate must be above 0 Hz, found {spec.sample_rate}')
-    for key in ('unit_factor', 'stamp_factor'):
-        if not getattr(spec, key) > 0.0:
-            raise InputError(
-                f"{where}: '{key}' must be above 0 (use sign: -1 to invert), "
-                f'found {getattr(spec, key)}')
+    for key in ('unit_factor', 'stamp_factor', 'sample_rate'):
+        value = getattr(spec, key)
+        if value is not None and not value > 0.0:
+            hint = ' (use sign: -1 to invert)' * (key == 'unit_factor')
+            raise InputError(f"{where}: '{key}' must be above 0{hint}, found {value}")
     # Report a malformed path now, with the file's name, rather than at the first message.
     for key, parsed in (('field', parse), ('stamp_field', parse_field_path)):
         path = getattr(spec, key)
