@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from mcap.writer import CompressionType, Writer
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    Definitions, FieldColumn, FieldReader, GrowingColumn, MessageTable)
+    Definitions, FieldColumn, FieldReader, joined_columns, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
@@ -286,14 +286,14 @@ def read_fields(
         return FieldReader(spec, bag.definitions(spec.type), refuse, second)
 
     readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}
-    found = {name: GrowingColumn() for name in specs}
+    found: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
     for part in bag.tables([spec.topic for spec in specs.values()], end_ns):
         for name, reader in readers.items():
             table = part.tables.get(reader.spec.topic)
             if table is not None:
                 counts[name] += table.n
-                found[name].add(reader.read(table))
+                found[name].append(reader.read(table))
         if progress is not None:
             progress(part.done)
     for name, spec in specs.items() if end_ns is None else ():
@@ -302,7 +302,7 @@ def read_fields(
             raise InputError(
                 f"{bag.path} is damaged: it states {stated} messages of topic '{spec.topic}', "
                 f'{counts[name]} were found; use --partial to read the intact part')
-    return {name: column.whole().in_time_order() for name, column in found.items()}
+    return {name: joined_columns(parts).in_time_order() for name, parts in found.items()}
 
 
 # Chunks are read together up to this size, bytes unpacked.

@@ -115,11 +115,8 @@ def _detect(path: Path, topics: Mapping[str, str], voltage_topic: str | None) ->
         _absolute(voltage_topic): topics[_absolute(voltage_topic)]}
     fitting = [config for config in configs if _by_name(config.voltage, considered)]
     if not fitting:
-        # If the user named a topic, its type decides; otherwise all topics are needed, to exclude
-        # the throttle's.
-        known = considered if voltage_topic is not None else topics
         fitting = [config for config in configs
-                   if config.generic and _only_of_type(config, known)]
+                   if config.generic and _only_of_type(config, considered)]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:

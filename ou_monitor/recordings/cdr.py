@@ -353,33 +353,21 @@ class FieldColumn(NamedTuple):
         return self.take(np.argsort(self.log_time, kind='stable'))
 
 
-class GrowingColumn:
-    """Joins columns by growing in place: the parts and the whole would take twice the memory."""
+_NO_MESSAGE = FieldColumn(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bool_),
+                          np.empty(0, np.int64), np.empty(0), np.empty(0))
 
-    # Type of each, and its usual value, which takes no memory until another one occurs.
-    _KINDS = ((np.uint64, None), (np.float64, None), (np.bool_, None), (np.int64, 1),
-              (np.float64, None), (np.float64, np.nan))
 
-    def __init__(self) -> None:
-        self._n = 0
-        self._grown = [bytearray() for _ in self._KINDS]
-
-    def add(self, column: FieldColumn) -> None:
-        """Append a column."""
-        for whole, part, (_, usual) in zip(self._grown, column, self._KINDS):
-            if usual is not None and not whole:
-                if np.array_equal(part, np.broadcast_to(usual, part.shape), equal_nan=True):
-                    continue
-                whole += np.full(self._n, usual, part.dtype).data
-            whole += np.ascontiguousarray(part).data
-        self._n += column.n
-
-    def whole(self) -> FieldColumn:
-        """Return all columns as one."""
-        return FieldColumn._make(
-            np.frombuffer(whole, kind) if whole or usual is None
-            else np.broadcast_to(usual, self._n)
-            for whole, (kind, usual) in zip(self._grown, self._KINDS))
+def joined_columns(parts: list[FieldColumn]) -> FieldColumn:
+    """Join parts, and empty their list: parts and whole would take twice the memory."""
+    columns: list[Any] = [list(pieces) for pieces in zip(_NO_MESSAGE, *parts)]
+    parts.clear()
+    for k, (_, *pieces) in enumerate(columns):
+        if pieces and not any(piece.strides[0] for piece in pieces):
+            # Views of one value: so is the whole.
+            columns[k] = np.broadcast_to(pieces[0][0], sum(piece.size for piece in pieces))
+        else:
+            columns[k] = np.concatenate(columns[k])
+    return FieldColumn(*columns)
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
@@ -439,7 +427,8 @@ class FieldReader:
     def read(self, table: MessageTable) -> FieldColumn:
         """Return the field of the messages of a table, in its order."""
         n = table.n
-        stamp, beside, count = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64)
+        stamp, count = np.full(n, np.nan), np.zeros(n, np.int64)
+        beside = np.full(n, np.nan) if len(self._fields) > 1 else np.broadcast_to(np.nan, n)
         # Indices of messages of one layout, shape (k,); their values, shape (k, values in each).
         blocks: list[tuple[IntArray, FloatArray]] = []
         kept, refused = np.ones(n, np.bool_), dict[int, str]()
@@ -469,6 +458,8 @@ class FieldReader:
         column = FieldColumn(table.log_time, stamp, stamped, count, values, beside)
         if refused:
             column = column.take(np.flatnonzero(kept))
+        elif self.spec.sample_rate is None:
+            column = column._replace(counts=np.broadcast_to(np.int64(1), n))
         zero, *others = (rule for _, _, rule in self._fields)
         return column._replace(values=zero.apply(column.values),
                                beside=others[0].apply(column.beside) if others else column.beside)
