@@ -247,32 +247,24 @@ class Repeats:
         return fresh
 
 
-def reading_places(y: FloatArray) -> tuple[Picked, float]:
-    """Return the indices of new readings in a voltage, V, and the samples per reading."""
+def new_readings(t: FloatArray, y: FloatArray) -> tuple[Picked, FloatArray, float]:
+    """Return indices of new readings (t in s, y in V), their times, s, and samples per reading."""
     repeats = Repeats()
     first = max(0, (y.size - _MIDDLE) // 2)
-    repeats.period = refresh_period(y[first:first + _MIDDLE])
-    if repeats.period <= 1.0:
-        return slice(None), 1.0
-    return np.flatnonzero(repeats.fresh(np.stack([np.empty(y.size), y]))), repeats.period
-
-
-def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return the readings of a series (t in s) and the samples per reading."""
-    places, period = reading_places(y)
-    return reading_times(t[places], period), y[places], period
-
-
-def reading_times(t: FloatArray, period: float) -> FloatArray:
-    """Return when the source was read, s, given the stamps t at which readings were logged."""
+    repeats.period = period = refresh_period(y[first:first + _MIDDLE])
+    if period <= 1.0:
+        return slice(None), t, 1.0
+    places = np.flatnonzero(repeats.fresh(np.stack([np.empty(y.size), y])))
+    t = t[places]
     # A reading is logged up to one logger step late.  If the period is not a whole number of
     # logger steps, the source has its own clock: the readings lie on the even grid nearest to t.
-    if t.size < 2 or abs(period - round(period)) < _WHOLE:
-        return t
-    usual = (t[-1] - t[0]) / (t.size - 1)
-    grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
-    # A logger step is 1/period of the usual step of t.
-    return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t
+    if t.size > 1 and abs(period - round(period)) >= _WHOLE:
+        usual = (t[-1] - t[0]) / (t.size - 1)
+        grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
+        # A logger step is 1/period of the usual step of t.
+        if float(np.abs(t - grid).max()) < 1.5 * usual / period:
+            t = grid
+    return places, t, period
 
 
 def scatter_words(t: FloatArray, least: float) -> str:
@@ -295,10 +287,9 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 def readings_of(recording: Recording) -> Recording:
     """Return a recording without repeats of a reading; a note counts the repeats."""
-    places, period = reading_places(recording.voltage)
+    places, t, period = new_readings(recording.t, recording.voltage)
     if period <= 1.0:
         return recording
-    t = reading_times(recording.t[places], period)
     note = repeats_words(recording.t, t)
     return replace(part_of(recording, places, note), t=t,
                    held=recording.held + recording.n - t.size)

@@ -40,7 +40,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline import refreshes, repeats_words
+from ou_monitor.timeline import new_readings, repeats_words
 from scipy import stats
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
@@ -178,10 +178,10 @@ def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
              ) -> tuple[FloatArray, FloatArray]:
     """Return the voltage without repeated readings; note how many were left out."""
     good = np.isfinite(t) & np.isfinite(voltage)
-    at, values, period = refreshes(t[good], voltage[good])
+    places, at, period = new_readings(t[good], voltage[good])
     if period > 1.0:
         notes.append(repeats_words(t[good], at))
-        return at, values
+        return at, voltage[good][places]
     return t, voltage
 
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from ou_monitor.timeline import reading_places, reading_times
+from ou_monitor.timeline import new_readings
 
 # Maximum values used to find the step and clipping.
 EXAMINED = 200_000
@@ -211,8 +211,8 @@ _EXAMINED = 200_000
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
     """Return the readings, and the number of samples per reading (1 without repeats)."""
-    places, period = reading_places(v)
-    t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
+    places, t, period = new_readings(t, v)
+    v, u = v[places], None if u is None else u[places]
     if period > 1.0:
         return t, v, u, period
     first = max(0, (v.size - _EXAMINED) // 2)

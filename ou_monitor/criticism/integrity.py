@@ -24,8 +24,7 @@ from ou_monitor.model.terms.shocks import outlying
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, percent
-from ou_monitor.timeline import (
-    on_grid, reading_places, reading_times, repeats_words, scatter_words)
+from ou_monitor.timeline import new_readings, on_grid, repeats_words, scatter_words
 
 # Minimum samples of a fit.
 LEAST = 100
@@ -67,9 +66,9 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     report(0.2)
     exact: list[Term] = []
     # A recording made in Python may still contain the steady repeats of a logger.
-    places, period = reading_places(v)
     whole = t
-    t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
+    places, t, period = new_readings(t, v)
+    v, u = v[places], None if u is None else u[places]
     logged = Samples(t[:_EXAMINED], v[:_EXAMINED], None)
     t, v, u, held = without_repeats(t, v, u)
     u, full = load_of(recording, t, v, u, notes)
