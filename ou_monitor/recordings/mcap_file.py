@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from array import array
 import bisect
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 import io
 import math
 import os
@@ -39,7 +39,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.cdr import gather, IntArray, joined, MessageTable
 from ou_monitor.recordings.importers.formats import kind_of_foreign, MAGIC
 from ou_monitor.records import Defect, Note
-from ou_monitor.stream.files import open_regular, parse_yaml, path_words, plain_texts
+from ou_monitor.stream.files import opened, parse_yaml, path_words, plain_texts
 from ou_monitor.text import counted, printable
 import zstandard
 
@@ -167,7 +167,7 @@ class McapFile:
         self._trusted = False
         # Shared, because creating one takes as long as unpacking a small chunk.
         self._zstd = zstandard.ZstdDecompressor()
-        with self._open() as file:
+        with opened(self.path) as file:
             self._size = file.seek(0, os.SEEK_END)
             self._limit = _chunk_limit(self._size)
             self._limit_of_all = max(16 * self._limit, _MOST_RATIO * self._size)
@@ -181,14 +181,6 @@ class McapFile:
             self._summary = self._read_summary(file)
             self._walk(file, self._use_summary(partial))
         self.origin_ns = self.start_ns
-
-    @contextmanager
-    def _open(self) -> Iterator[BinaryIO]:
-        try:
-            with open_regular(self.path) as file:
-                yield file
-        except OSError as error:
-            raise InputError(f'cannot read {self.path}: {error.strerror}') from error
 
     @property
     def damage(self) -> str:
@@ -510,7 +502,7 @@ class McapFile:
 
     def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, MessageTable]:
         """Return the messages of some spans by topic, in the order of the file."""
-        with self._open() as file:
+        with opened(self.path) as file:
             table = joined([self._table_of(file, span) for span in spans])
         topics: dict[str, npt.NDArray[np.bool_]] = {}
         channels = self.channels_of(wanted)

@@ -53,6 +53,16 @@ def open_regular(path: str | Path) -> BinaryIO:
     return file
 
 
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open as `open_regular`; errors of opening and reading become InputErrors."""
+    try:
+        with open_regular(path) as file:
+            yield file
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror}') from error
+
+
 def write_whole(path: Path, content: bytes, *, over: bool = True) -> None:
     """Write a file completely or not at all; replace an existing one only with `over`."""
     draft = path.with_name(f'.{path.name}.{os.getpid()}.draft')

@@ -35,7 +35,7 @@ from ou_monitor.recordings.importers.csv_cells import (
 from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign, TEXT
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.files import open_regular
+from ou_monitor.stream.files import opened
 
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
@@ -109,13 +109,10 @@ class Form(NamedTuple):
 
 def form_of(path: Path, wanted: CsvColumns, *, header: bool = False) -> Form:
     """Detect the format from the first lines (header: the first one alone, up to any damage)."""
-    try:
-        with open_regular(path) as file:
-            head = file.read(_HEAD)
-            if header:
-                head = _DAMAGE.split(head.split(b'\n')[0])[0]
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror}') from error
+    with opened(path) as file:
+        head = file.read(_HEAD)
+    if header:
+        head = _DAMAGE.split(head.split(b'\n')[0])[0]
     encoding = _encoding(path, head)
     text = head.decode(encoding, 'ignore')
     lines = io.StringIO(text, newline=None).readlines()[:_HEAD_LINES]
@@ -461,7 +458,7 @@ def numbers(path: Path, form: Form, places: Sequence[int],
     last = max([*places, *(texts or {}), *(place + 1 for place in with_unit)])
     width = len(form.names)
     try:
-        with io.TextIOWrapper(open_regular(path), form.encoding, newline=None) as file:
+        with opened(path) as raw, io.TextIOWrapper(raw, form.encoding, newline=None) as file:
             for begin, block in _blocks(path, file, form, width):
                 rows = block
                 if len(rows[0]) <= last or len(rows[0]) > width or len(set(map(len, rows))) > 1:
@@ -489,8 +486,6 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                         part[-1] = part[-1][good]
                 for place, text in (texts or {}).items():
                     text += (cell for cell, fine in zip(columns[place], good) if fine)
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror}') from error
     except UnicodeDecodeError as error:
         why = ('it is cut off in the middle of a character'
                if re.search('truncated|unexpected end', error.reason) else error)

@@ -20,7 +20,7 @@ import numpy as np
 from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
 from ou_monitor.records import defect_of, Note
-from ou_monitor.stream.files import open_regular, plain_texts
+from ou_monitor.stream.files import opened, plain_texts
 from ou_monitor.text import printable
 
 # Number of first bytes that identify a format; a dataflash text log starts with FMT messages.
@@ -125,11 +125,8 @@ def detect(path: Path) -> Format:
         raise InputError(f"'{path}' is a folder: name a log file")
     if not path.exists():
         raise InputError(f"there is no log '{path}': check the path")
-    try:
-        with open_regular(path) as file:
-            head = file.read(HEAD)
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror}') from error
+    with opened(path) as file:
+        head = file.read(HEAD)
     if not head:
         raise InputError(f"'{path}' is empty: there is nothing to convert")
     found = format_of(head)
