@@ -135,9 +135,8 @@ def rosbags(path: Path, case: Case) -> Columns:
 def ours(path: Path, case: Case) -> Columns:
     """Read with this package, into the same arrays as rosbags."""
     bag = BagReader(path)
-    choice = choose(path, bag.topics, msg_config=case.config)
-    columns = read_fields(bag, {VOLTAGE: choice.specs['voltage'],
-                                THROTTLE: choice.specs['throttle']})
+    _, specs, _ = choose(path, bag.topics, msg_config=case.config)
+    columns = read_fields(bag, {VOLTAGE: specs['voltage'], THROTTLE: specs['throttle']})
     return {topic: (column.stamp, column.values) for topic, column in columns.items()}
 
 

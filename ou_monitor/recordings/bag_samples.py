@@ -9,7 +9,7 @@ user must choose.  Limits: the samples of a bag are in memory at once: 150 MB fo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +29,11 @@ from ou_monitor.text import counted, outside_words, part_words, printable, some
 from ou_monitor.timeline import BATCH, check_throttle
 
 
-@dataclass(frozen=True)
-class TopicChoice:
-    """The fields to read from a bag."""
-
-    config: MsgConfig  # The source
-    # Fields, with the topics of this bag, by VOLTAGE and, where present, THROTTLE and CURRENT.
-    specs: dict[str, FieldSpec]
-    notes: tuple[str, ...]  # Notes on unexpected choices, one sentence each
-
-
 def choose(
     path: Path, topics: Mapping[str, str], *, msg_config: str | Path | None = None,
     voltage_topic: str | None = None, throttle_topic: str | None = None,
-) -> TopicChoice:
-    """Choose the config and the topics."""
+) -> tuple[MsgConfig, dict[str, FieldSpec], tuple[str, ...]]:
+    """Return the config, its fields with the topics of this bag, by quantity, and notes."""
     for topic in (voltage_topic, throttle_topic):
         if topic is not None and _absolute(topic) not in topics:
             raise InputError(f"{path}: no topic '{topic}': {nearest(_absolute(topic), topics)}")
@@ -75,8 +65,7 @@ def choose(
                          'choose with --voltage-topic.')
     specs = {VOLTAGE: replace(config.voltage, topic=topic), THROTTLE: throttle,
              CURRENT: _current(config, topics, topic)}
-    return TopicChoice(config, {name: spec for name, spec in specs.items() if spec is not None},
-                       notes)
+    return config, {name: spec for name, spec in specs.items() if spec is not None}, notes
 
 
 def listed(topics: Mapping[str, str]) -> str:
@@ -184,8 +173,7 @@ def read_bag(
 ) -> RawColumns:
     """Read voltage, throttle and current of a bag, start and end in s; see `read_recording`."""
     bag = BagReader(path, partial=partial)
-    choice = choose(bag.path, bag.topics, **of_bags)
-    specs = dict(choice.specs)
+    config, specs, said = choose(bag.path, bag.topics, **of_bags)
     stated = bag.sample_rates.get(specs[VOLTAGE].topic)
     if specs[VOLTAGE].sample_rate is not None and stated is not None:
         # The rate stated in the bag overrides the config's.
@@ -196,7 +184,7 @@ def read_bag(
         except InputError:
             # Older types of a battery have no current.
             del specs[CURRENT]
-    notes = [*bag.notes, *choice.notes]
+    notes = [*bag.notes, *said]
     if bag.damage is not None:
         notes.append(Note(f'The bag is damaged; its intact part was read: {bag.damage}.',
                           Defect.DAMAGED_FILE))
@@ -254,7 +242,8 @@ def read_bag(
     if CURRENT in holds:
         current = holds[CURRENT].at(t)
     throttle = holds[THROTTLE].at(t) if THROTTLE in holds else np.full(t.size, np.nan)
-    return RawColumns(t, volts, throttle, current, name, _source(bag, choice, name), tuple(notes))
+    return RawColumns(t, volts, throttle, current, name, _source(bag, specs, config, name),
+                      tuple(notes))
 
 
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
@@ -279,11 +268,12 @@ def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArr
     return hold, unknown
 
 
-def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
+def _source(bag: BagReader, specs: Mapping[str, FieldSpec], config: MsgConfig, name: str,
+            ) -> dict[str, str]:
     """Return topics, types, files and metadata of the bag."""
-    source = {**bag.about, 'file': name, 'format': 'mcap', 'msg_config': choice.config.name}
+    source = {**bag.about, 'file': name, 'format': 'mcap', 'msg_config': config.name}
     for which in (VOLTAGE, THROTTLE):
-        spec = choice.specs.get(which)
+        spec = specs.get(which)
         if spec is not None:
             # A converted bag names the field of the log that became the topic.
             field = bag.about.get(f'{spec.topic[1:]}_field', spec.field)
