@@ -222,7 +222,7 @@ def replacing(bag: Path | None, force: bool) -> Iterator[None]:
     if bag.is_dir() and not bag.is_symlink():
         files: list[Path] = []
         with suppress(InputError):
-            files = read_metadata(bag).paths
+            files, _ = read_metadata(bag)
         if not files or {*bag.iterdir()} != {bag / 'metadata.yaml', *files}:
             raise InputError(f"'{bag}' is a folder that holds no bag, or more than a bag: it is "
                              'not overwritten')

@@ -38,14 +38,6 @@ _ROOT = 'rosbag2_bagfile_information'
 _FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
-class BagFiles(NamedTuple):
-    """Files and metadata of a bag."""
-
-    paths: list[Path]  # MCAP files in recorded order
-    about: dict[str, str]  # Custom data of the recording, such as its vehicle
-    missing: str  # Description of missing files; '' when complete
-
-
 def _qos() -> list[dict[str, Any]]:
     """Return the QoS that rosbag2 writes; its dicts are copies, or YAML would write aliases."""
     return [{
@@ -55,8 +47,8 @@ def _qos() -> list[dict[str, Any]]:
 
 
 @one_line()
-def read_metadata(folder: Path) -> BagFiles:
-    """Return the MCAP files and the metadata of a rosbag2 directory."""
+def read_metadata(folder: Path) -> tuple[list[Path], dict[str, str]]:
+    """Return the MCAP files of a rosbag2 directory, as recorded, and its custom data."""
     path = folder / FILE
     where = path_words(path)
     content = read_yaml(path, 'the metadata', most_bytes=MOST_BYTES, most_nodes=MOST_NODES)
@@ -78,7 +70,7 @@ def read_metadata(folder: Path) -> BagFiles:
         if not file.is_file():
             raise InputError(f"{where} names '{printable(file.name, 60)}', which is not in its "
                              'folder')
-    return BagFiles(files, custom_data(info), '')
+    return files, custom_data(info)
 
 
 def is_part(file: Path, folder: Path) -> bool:
@@ -87,17 +79,17 @@ def is_part(file: Path, folder: Path) -> bool:
     return file.stem.startswith(begin) and file.stem[len(begin):].isdigit()
 
 
-def find_files(path: Path, partial: bool) -> BagFiles:
-    """Return the files and metadata of the bag at a path."""
+def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, str], str]:
+    """Return the files of a bag, as recorded, its custom data, and what is missing ('': none)."""
     if path.name == FILE and path.is_file():
         path = path.parent
     if not path.exists():
         raise InputError(f'{path} is a broken link' if path.is_symlink()
                          else f'there is no recording {path}: check the path')
     if not path.is_dir():
-        return BagFiles([path], {}, '')
+        return [path], {}, ''
     if (path / FILE).exists():
-        return read_metadata(path)
+        return *read_metadata(path), ''
     # NAME_0.mcap .. NAME_10.mcap: the shorter name is the earlier one.
     files = sorted(path.glob('*.mcap'), key=lambda file: (len(file.name), file.name))
     if not files:
@@ -112,7 +104,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
                 f'{path}: {FILE} is missing: name one of the .mcap files in it; if they are one '
                 'recording that was cut off, use --partial')
         raise InputError(f'{path}: {missing}; use --partial to read the intact part')
-    return BagFiles(files, {}, missing)
+    return files, {}, missing
 
 
 def remove_bag(files: Iterable[Path], folder: Path | None) -> None:
