@@ -329,7 +329,7 @@ class IioBuffer:
                 # An incomplete block: the device is slower than its stated rate.
                 ready = len(kept) // self._scan.size * self._scan.size
                 if ready:
-                    yield from self._decode(kept[:ready], time.time())
+                    yield from self._decode(kept[:ready])
                     kept = kept[ready:]
                 yield None
                 continue
@@ -346,10 +346,11 @@ class IioBuffer:
                 continue
             kept += data
             if len(kept) >= whole:
-                yield from self._decode(kept, time.time())
+                yield from self._decode(kept)
                 kept = b''
 
-    def _decode(self, data: bytes, now: float) -> Iterator[Block]:
+    def _decode(self, data: bytes) -> Iterator[Block]:
+        now = time.time()
         volts = self._scan.volts(data, self.channel, self._scale, self._offset)
         if self._clock is None:
             yield Block(now, volts, math.nan)

@@ -260,13 +260,13 @@ def _same_fields(schema: Any, other: Any) -> bool:
 def read_fields(
     bag: BagReader, specs: Mapping[str, FieldSpec], *, end_ns: int | None = None,
     progress: Callable[[float], None] | None = None,
-    broken: Callable[[str], None] | None = None, beside: Mapping[str, FieldSpec] | None = None,
+    broken: list[str] | None = None, beside: Mapping[str, FieldSpec] | None = None,
 ) -> dict[str, FieldColumn]:
     """
     Return fields of a bag in the order of log times, at least to `end_ns`, ns.
 
-    `beside` names a second field to read from the same messages.  `broken` is called with the
-    reason for each message that cannot be decoded; if it is None, the first raises InputError.
+    `beside` names a second field to read from the same messages.  `broken` gets an item for each
+    message that cannot be decoded, the first its reason; if it is None, this raises InputError.
     """
     def reader_of(spec: FieldSpec, second: FieldSpec | None) -> FieldReader:
         def refuse(log_time: int, why: str) -> None:
@@ -274,7 +274,7 @@ def read_fields(
                      f'({moment(log_time, bag.start_ns)})')
             if broken is None:
                 raise InputError(f'{words}; use --partial to leave it out')
-            broken(words)
+            broken.append('' if broken else words)
         return FieldReader(spec, bag.definitions(spec.type), refuse, second)
 
     readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}

@@ -191,18 +191,13 @@ def read_bag(
     if start is not None or end is not None:
         notes.append(part_words(start, end))
     broken: list[str] = []
-
-    def leave_out(words: str) -> None:
-        # The first one is reported.
-        broken.append('' if broken else words)
-
     first = 0 if start is None else _limit(bag, start)
     last = None if end is None else _limit(bag, end)
     # A current in the messages of the voltage belongs to the same message's voltage.
     own = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
     beside = {VOLTAGE: specs.pop(CURRENT)} if own else {}
     columns = read_fields(bag, specs, end_ns=last, progress=progress, beside=beside,
-                          broken=leave_out if partial else None)
+                          broken=broken if partial else None)
     if last is not None:
         columns = {which: one.split(one.place(last))[0] for which, one in columns.items()}
     if broken:
