@@ -447,14 +447,14 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
 
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None,
-            left_out: list[str] | None = None, units: bool = True,
-            only: tuple[int, frozenset[str]] | None = None) -> list[FloatArray]:
+            left_out: list[str] | None = None, only: tuple[int, frozenset[str]] | None = None,
+            ) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
-    # only: a column, and the words in it whose rows hold numbers; words in others are NaN.
+    # only: a column, and the words in it whose rows hold numbers; words in others are NaN, and a
+    # number with another unit in the next column is not converted.
     # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
-    # units: whether a number with another unit in the next column is converted.
     parts: list[list[FloatArray]] = [[] for _ in places]
-    with_unit = [place for place in places if units and has_unit_beside(form.names, place)]
+    with_unit = [place for place in places if not only and has_unit_beside(form.names, place)]
     last = max([*places, *(texts or {}), *(place + 1 for place in with_unit)])
     width = len(form.names)
     try:

@@ -577,14 +577,13 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     if _holds_clocks(form, time.place[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
-                         left_out, texts is None, only)
+                         left_out, only)
         cells = list(map(' '.join, zip(*clocks)))
         if len(clocks) > 1 and all(re.fullmatch(r'[\d.]+', part) for part in clocks[1]):
             cells = [f"{clock}.{part.split('.')[-1] if '.' in part else f'{part:0>3}'}"
                      for clock, part in zip(*clocks)]
         return clock_times(path, cells, time.name, left_out), values
-    t, *values = numbers(
-        path, form, [*time.place, *places], texts, left_out, texts is None, only)
+    t, *values = numbers(path, form, [*time.place, *places], texts, left_out, only)
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
