@@ -109,7 +109,7 @@ def test_a_result_is_pickled_and_copied(found):
 def test_a_result_has_the_attributes_of_its_record(found):
     finding = found['discover']
     assert finding.causes is finding.record.causes and not hasattr(finding, 'nonsense')
-    assert str(finding) == terminal(finding.document(''))
+    assert str(finding) == terminal(finding.document())
     assert repr(finding).startswith('<Finding: A plain simulation lacks')
 
 

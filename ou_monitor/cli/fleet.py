@@ -114,8 +114,7 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     # Again, because the run may have taken hours.
     _check_own(folder, args.force)
     write_table(fleet.rows, folder / TABLE)
-    found = Result(fleet, lambda command: fleet_document(fleet, command), lambda: as_data(fleet),
-                   lambda: fleet.rows)
+    found = Result(fleet, lambda: fleet_document(fleet), lambda: as_data(fleet), 'rows')
     output.deliver(args, found, table=folder / TABLE, report=folder / REPORT)
 
 

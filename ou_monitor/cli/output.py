@@ -290,10 +290,10 @@ def deliver(args: argparse.Namespace, found: Result, report: str | Path | None =
     # The caller has checked the path of a `report`, so an existing page is overwritten.
     force = args.force or report is not None
     report = report or getattr(args, 'report', None)
-    document = found.document(shlex.join(['ou-monitor', *args.words]))
+    document = found.document()
     if report is not None:
         from ou_monitor.report.page import html
-        write_text(html(document), report, force)
+        write_text(html(document, shlex.join(['ou-monitor', *args.words])), report, force)
     tell(args, document, found.to_dict)
     if args.json != STDOUT:
         summary(document.answer, **files, report=report, json=args.json)

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         output.write_text(as_yaml(found.file), args.save_model, args.force)
     if args.output is None:
         return 0
-    said = found.document('')
+    said = found.document()
     output.tell(args, Document(said.title, said.subject, (), ()), found.to_dict)
     return 0
 

@@ -35,7 +35,7 @@ _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
           'one_relaxation': 'not one relaxation', 'second_relaxation': 'second relaxation'}
 
 
-def analysis_document(analysis: Analysis, command: str = '') -> Document:
+def analysis_document(analysis: Analysis) -> Document:
     """Return the report of an analysis."""
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
@@ -58,7 +58,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
     if recording.source:
         parts.append(lambda: [Section('Source of the recording', [Facts(list(
             recording.source.items()))], folded=True)])
-    return Document('Supply noise', subject, answer(analysis), parts, command)
+    return Document('Supply noise', subject, answer(analysis), parts)
 
 
 def answer(analysis: Analysis) -> list[str]:

@@ -21,7 +21,7 @@ _NOTHING = (0.0, 0.0)
 _TOO_MANY = 3
 
 
-def comparison_document(found: Agreement, seen: Overview, command: str = '') -> Document:
+def comparison_document(found: Agreement, seen: Overview) -> Document:
     """Return the report of a comparison; `seen` holds the facts of the recording."""
     first, last = found.simulated
     subject = (f'{found.recording or "recording"}: '
@@ -43,7 +43,7 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
              'reported to differ.',
              legend=True)]
     return Document('Compared with its simulation', subject, [*seen.beware, *_answer(found)],
-                    parts, command)
+                    parts)
 
 
 def _answer(found: Agreement) -> list[str]:

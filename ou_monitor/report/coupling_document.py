@@ -13,7 +13,7 @@ from ou_monitor.text import chance, counted, number, p_words
 
 
 def coupling_document(found: Coupling, recording: Recording, signal: tuple[FloatArray, FloatArray],
-                      name: str, unit: str, seen: Overview, command: str = '') -> Document:
+                      name: str, unit: str, seen: Overview) -> Document:
     """Return the report of a coupling; `signal` holds stamps, s, and values."""
     grid, per = found.grid, f'{unit or "signal units"} per V'
     subject = (f'{recording.name}, {name}: {grid.duration:.4g} s covered by both, '
@@ -35,7 +35,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
         Section('What to know before using these numbers',
                 [Notes.of(dict.fromkeys([*recording.notes, *lost, *gaps, *found.notes]))])]
     return Document(f'Supply noise in {name}', subject,
-                    [*seen.beware, _answer(found, name, per), answers(seen)[0]], parts, command)
+                    [*seen.beware, _answer(found, name, per), answers(seen)[0]], parts)
 
 
 def _answer(found: Coupling, name: str, per: str) -> str:

@@ -18,8 +18,7 @@ _EVERY = 10
 _LEAST_RISK = 1e-9
 
 
-def design_document(result: Design, source: str, taken: str = '', command: str = '',
-                    ) -> Document:
+def design_document(result: Design, source: str, taken: str = '') -> Document:
     """Return the report of a design (source: of the limit; taken: describes a flight's values)."""
     present = result.present
     chosen = [(present, 'present')]
@@ -55,7 +54,7 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
                 lever.words(lever.least) if math.isfinite(lever.least) else 'out of reach']
                for lever in result.levers],
               left=[0, 1]),
-        *map(Text, (effect(result), *remarks(result), taken))], command)
+        *map(Text, (effect(result), *remarks(result), taken))])
 
 
 def _risk(result: Design) -> Plot:

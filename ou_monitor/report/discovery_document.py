@@ -34,8 +34,7 @@ _STRAIGHT = 4.0
 _TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 
 
-def discovery_document(finding: Finding, seen: Overview | None = None, command: str = '',
-                       ) -> Document:
+def discovery_document(finding: Finding, seen: Overview | None = None) -> Document:
     """Return the report of a discovery; `seen` holds the facts of the recording."""
     samples, baseline = finding.samples, finding.baseline
     used = '' if samples is None or samples.n == finding.n else f', {samples.n} used'
@@ -59,8 +58,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
     parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
     beware = () if seen is None else seen.beware
-    return Document('What the simulation gets wrong', subject, [*beware, *finding.words], parts,
-                    command)
+    return Document('What the simulation gets wrong', subject, [*beware, *finding.words], parts)
 
 
 def _inputs(finding: Finding) -> str:

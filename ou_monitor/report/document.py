@@ -111,7 +111,6 @@ class Document:
     subject: str  # Recording and its size, one line
     answer: Sequence[str]  # Sentences, most important first
     parts: Sequence[Part]
-    command: str = ''  # Command that makes this report
 
     @property
     def headline(self) -> str:

@@ -49,7 +49,7 @@ LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s'
                 'resistance, mOhm', 'sag, V', 'at throttle')
 
 
-def fleet_document(fleet: Fleet, command: str = '') -> Document:
+def fleet_document(fleet: Fleet) -> Document:
     """Return the report of a fleet."""
     rows = worst(fleet)
     odd, possible = finding_words(fleet), fleet.judgement.possible
@@ -83,7 +83,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Section('What to know before using these numbers', [
             Notes.of([*fleet.notes, *comparison_words(fleet)])]),
         lambda: [Section('Recordings', _recordings(fleet), folded=True)]]
-    return Document(TITLE, subject, answer(fleet), parts, command)
+    return Document(TITLE, subject, answer(fleet), parts)
 
 
 def answer(fleet: Fleet) -> list[str]:

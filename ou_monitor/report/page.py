@@ -205,11 +205,11 @@ def _head(text: str) -> str:
     return text[:1].upper() + text[1:] if first.isascii() and len(first) > 1 else text
 
 
-def html(document: Document) -> str:
-    """Return a document as a self-contained page."""
+def html(document: Document, command: str = '') -> str:
+    """Return a document as a self-contained page (command: makes it again)."""
     body = _joined(document.parts)
-    if document.command:
-        again = f'<p><code>{escape(document.command)}</code></p>'
+    if command:
+        again = f'<p><code>{escape(command)}</code></p>'
         body += '\n' * bool(body) + _folded('<h2>To repeat this</h2>', again)
     text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
     policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "

@@ -20,7 +20,7 @@ from ou_monitor.text import percent
 _BINS = 40  # Of the histogram of crest factors
 
 
-def reproduction_document(result: Reproduction, command: str = '') -> Document:
+def reproduction_document(result: Reproduction) -> Document:
     """Return the report of a reproduction."""
     parts: list[Part] = [
         lambda: [Section('Figures, simulated from the numbers printed', [
@@ -39,7 +39,7 @@ def reproduction_document(result: Reproduction, command: str = '') -> Document:
              'within their standard errors.', legend=True)]
     return Document('The paper, recomputed', 'Deterministic and stochastic matrix modeling of '
                     'radiophysical processes in UAV microcontroller systems',
-                    [headline(result)], parts, command)
+                    [headline(result)], parts)
 
 
 def _table(rows: Sequence[Row]) -> Table:

@@ -53,7 +53,7 @@ class Result:
 
     """
 
-    def __init__(self, record: Any, document: Callable[[str], Document],
+    def __init__(self, record: Any, document: Callable[[], Document],
                  data: Callable[[], Mapping[str, Any]], rows: str | Callable[[], Rows],
                  supply: SupplyFacts | Callable[[], SupplyFacts] | None = None) -> None:
         """
@@ -127,7 +127,7 @@ class Result:
             By title, the main one first.
 
         """
-        return {plot.title: plot for plot in _plots(self.document('').parts)}
+        return {plot.title: plot for plot in _plots(self.document().parts)}
 
     def plot(self, ax: Axes | None = None, title: str | None = None) -> Axes:
         """
@@ -161,17 +161,17 @@ class Result:
     def _repr_html_(self) -> str:
         from ou_monitor.report.page import section
 
-        return section(self.document(''))
+        return section(self.document())
 
     def __str__(self) -> str:
         """Return what the command prints."""
         from ou_monitor.report.terminal import terminal
 
-        return terminal(self.document(''))
+        return terminal(self.document())
 
     def __repr__(self) -> str:
         """Return the kind of the record, and the answer."""
-        return f'<{type(self.record).__name__}: {self.document("").headline}>'
+        return f'<{type(self.record).__name__}: {self.document().headline}>'
 
 
 def _cells(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

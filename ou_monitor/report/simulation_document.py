@@ -11,8 +11,7 @@ from ou_monitor.report.svg import Plot
 from ou_monitor.simulation import Run
 
 
-def simulation_document(run: Run, output: str | Path | None = None, command: str = '',
-                        ) -> Document:
+def simulation_document(run: Run, output: str | Path | None = None) -> Document:
     """Return the report of a simulation; `output` is the bag, if one was written."""
     terms = run.file.model.terms
     said = (f"{run.n} samples of '{run.name}', {run.duration:g} s at {run.rate:g} Hz, "
@@ -23,7 +22,7 @@ def simulation_document(run: Run, output: str | Path | None = None, command: str
                      Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
                          run.recording.t, run.recording.throttle, '', 2))],
             Facts([(term.NAME, ', '.join(f'{name} {_words(value)}' for name, value in
-                                         term.values().items())) for term in terms])], command)
+                                         term.values().items())) for term in terms])])
 
 
 def _words(value: object) -> str:

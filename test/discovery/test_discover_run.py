@@ -107,7 +107,7 @@ def test_a_path_is_read(tmp_path):
 
 def test_the_page_shows_verdict_causes_plots_and_command(sag):
     """Well formed, escaped, finite; verdict, cause, pictures, command."""
-    html = page_of(discovery_document(sag, command='ou-monitor discover x.csv'))
+    html = page_of(discovery_document(sag), 'ou-monitor discover x.csv')
     root = self_contained(html)
     text = ' '.join(''.join(root.itertext()).split())
     assert 'sag <b>' in text and '<b>' not in html

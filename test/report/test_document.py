@@ -20,9 +20,8 @@ def plot():
     return Plot(EVIL, EVIL, EVIL).line(np.arange(3.0), np.arange(3.0), EVIL).mark(0.5, EVIL)
 
 
-def document(*parts, **more):
-    return Document(**{'title': 'Title', 'subject': 'a.csv', 'answer': ['One.', 'Two.'],
-                       'parts': parts, **more})
+def document(*parts):
+    return Document('Title', 'a.csv', ['One.', 'Two.'], parts)
 
 
 def test_every_part_is_on_the_page_escaped():
@@ -30,7 +29,7 @@ def test_every_part_is_on_the_page_escaped():
     page = html(Document(EVIL, EVIL, [EVIL], [
         Text(EVIL), Facts([(EVIL, EVIL)]), Notes.of([EVIL], Severity.WARNING),
         Table([EVIL], [[EVIL + '\n' + EVIL]]), Pair([Figure(plot(), EVIL)]),
-        Section(EVIL, [Text(EVIL)], folded=True), lambda: [Text(EVIL)]], EVIL))
+        Section(EVIL, [Text(EVIL)], folded=True), lambda: [Text(EVIL)]]), EVIL)
     tree = self_contained(page)
     assert '<script>alert' not in page
     assert sum(EVIL in (e.text or '') for e in tree.iter()) >= 13
@@ -73,8 +72,9 @@ def test_a_page_has_typographic_signs():
     """Plus-minus, minus, unknown, symbols of heads, the small line of a cell; not in a command."""
     found = document(Table(['sigma, V/sqrt(s)\n[95 %]', 'time, s'],
                            [['-1.5 +- 0.2\n[-1.7, -1.3]', '-']]),
-                     Text('2026-11-23, load-step: -3 mV'), command='ou-monitor a-5.csv --x -3')
-    text = '|'.join(parsed(html(found)).find('body').itertext())
+                     Text('2026-11-23, load-step: -3 mV'))
+    page = html(found, 'ou-monitor a-5.csv --x -3')
+    text = '|'.join(parsed(page).find('body').itertext())
     for wanted in ('σ, V/√s', 'Time, s', '−1.5 ± 0.2', '[−1.7, −1.3]', '|–|',
                    '2026-11-23, load-step: −3 mV', 'ou-monitor a-5.csv --x -3'):
         assert wanted in text, wanted

@@ -35,7 +35,7 @@ def odd() -> Fleet:
 
 def page_text(simulated: Fleet) -> str:
     """Return the text of the report, which is well-formed."""
-    page = html(fleet_document(simulated, "ou-monitor fleet 'a <b>'"))
+    page = html(fleet_document(simulated), "ou-monitor fleet 'a <b>'")
     root = ElementTree.fromstring(page.split('\n', 1)[1])
     return ' '.join(' '.join(root.itertext()).split())
 

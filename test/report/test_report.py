@@ -112,8 +112,8 @@ def analysis_of(**changes):
 
 def test_report_is_self_contained_and_well_formed():
     """No address, one script, nothing to fetch; the name is shown as it is."""
-    html = page_of(analysis_document(
-        analysis_of(brownout_voltage=4.5), "ou-monitor analyze '<b>.csv'"))
+    html = page_of(analysis_document(analysis_of(brownout_voltage=4.5)),
+                   "ou-monitor analyze '<b>.csv'")
     tree = self_contained(html)
     assert '<b>' not in html
     text = ' '.join(tree.itertext())

@@ -27,7 +27,7 @@ def result():
 @pytest.fixture(scope='module')
 def tree(result):
     """Return the page, parsed as XML."""
-    return self_contained(html(reproduction_document(result, 'ou-monitor reproduce --seed 3')))
+    return self_contained(html(reproduction_document(result), 'ou-monitor reproduce --seed 3'))
 
 
 def test_every_printed_number_has_its_row(result):
