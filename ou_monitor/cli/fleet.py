@@ -8,7 +8,7 @@ import math
 import os
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
@@ -17,6 +17,7 @@ from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
 if TYPE_CHECKING:
+    from ou_monitor.fleet.analysis import Options
     from ou_monitor.fleet.fleet import Fleet
 
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     _check_own(folder, args.force)
     output.check_writable(args.json)
 
-    options, more = _options(args)
+    options = _options(args)
     pattern = None if args.vehicle_from is None else read_pattern(args.vehicle_from)
     found = find_recordings(args.recordings, leave_out=folder)
     output.check_paths({f'recording {k}': source.path for k, source in enumerate(
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
             fleet = run_fleet(
                 found, folder, options, version, workers=args.workers or usable_cores(),
                 scheduler=args.scheduler, insecure=args.insecure, pattern=pattern,
-                stated_options=more, comparing=comparing, progress=progress)
+                comparing=comparing, progress=progress)
     except KeyboardInterrupt:
         print(f"stopped; finished recordings are kept in '{folder}', and the same command "
               'resumes', file=sys.stderr)
@@ -118,19 +119,19 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     output.deliver(args, found, table=folder / TABLE, report=folder / REPORT)
 
 
-def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """Return the options of the analysis, and a hash of the msg_config file that they name."""
+def _options(args: argparse.Namespace) -> Options:
+    """Return the options of the analysis."""
     from ou_monitor.analysis.crafts import pack_limit
     from ou_monitor.fleet.analysis import Options
 
-    config, more = args.msg_config, {}
+    config, content = args.msg_config, ''
     if config is not None:
         if not config:
             raise InputError('--msg-config: the path is empty')
         if Path(config).is_file():
             config = str(Path(config).resolve())
             try:
-                more['msg_config_content'] = hashlib.blake2b(Path(config).read_bytes()).hexdigest()
+                content = hashlib.blake2b(Path(config).read_bytes()).hexdigest()
             except OSError as error:
                 raise InputError(f"--msg-config: cannot read '{config}': {error.strerror}"
                                  ) from error
@@ -143,6 +144,6 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         levels=args.levels, window=args.window,
         brownout_voltage=math.nan if limit is None else limit,
         brownout_horizon=args.brownout_horizon, cells=args.cells or 0,
-        msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
-        columns=columns_given(args), partial=args.partial, discover=args.discover,
-        seed=args.seed), more
+        msg_config=config, msg_config_hash=content, voltage_topic=args.voltage_topic,
+        throttle_topic=args.throttle_topic, columns=columns_given(args), partial=args.partial,
+        discover=args.discover, seed=args.seed)

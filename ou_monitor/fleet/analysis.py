@@ -36,6 +36,7 @@ class Options:
     cells: int = 0  # Cells in series; 0: from the log, else a guess
     # Arguments of `read_recording`.
     msg_config: str | None = None
+    msg_config_hash: str = ''  # Of the file's content; a changed file is analysed again
     voltage_topic: str | None = None
     throttle_topic: str | None = None
     columns: CsvColumns | None = None

@@ -26,6 +26,9 @@ from ou_monitor.text import printable
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
 # Endings shared by other files, which are skipped without a note.
 _COMMON = ('', '.log', '.txt')
+# Files that are noted as skipped: what they are, and why.
+_CSV = '.csv file', 'without columns of time and voltage'
+_LOG = 'file', 'with the ending of a log, but in no known format'
 _BLOCK = 1 << 20  # Bytes read at once for the digest
 # Maximum depth of the folders searched.
 _MOST_DEPTH = 50
@@ -51,89 +54,70 @@ class SearchResult:
 
 def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> SearchResult:
     """Return the recordings at some paths."""
-    search = _Search(None if leave_out is None else leave_out.resolve())
+    left_out = None if leave_out is None else leave_out.resolve()
+    paths: set[Path] = set()
+    closed: list[str] = []
+    # Kind of file and why it is skipped -> files.
+    skipped: dict[tuple[str, str], list[Path]] = {_CSV: [], _LOG: []}
     for text in given:
         if not text:
             raise InputError('RECORDING: the path is empty')
         path = Path(text)
         if not path.exists():
             raise InputError(f"there is no recording or folder '{text}': check the path")
-        if leave_out is not None and path.resolve() == leave_out.resolve():
+        if path.resolve() == left_out:
             raise InputError(f"--output is the folder of the recordings, '{text}': name another")
         if path.is_dir() and not _is_bag(path):
-            search.walk(path)
+            for found in _candidates(path, left_out, closed):
+                kind = _kind(found)
+                if kind is None:
+                    paths.add(_real(found))
+                elif kind in skipped:
+                    skipped[kind].append(found)
         else:
-            search.add(path)
-    notes = search.notes()
-    if not search.paths:
+            paths.add(_real(path.parent if path.name == FILE else path))
+    notes = [f"{len(files)} {what}{'' if len(files) == 1 else 's'} skipped, such as '{files[0]}': "
+             f'{why}.' for (what, why), files in skipped.items() if files]
+    notes += [f'The folder {text} cannot be searched.' for text in closed]
+    if not paths:
         where = ', '.join(f"'{text}'" for text in given)
         raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, logs '
                          'of autopilots, or .csv files with columns of time and voltage'
                          + (f' ({" ".join(notes)})' if notes else ''))
-    return SearchResult(tuple(_source(path) for path in sorted(search.paths)),
+    return SearchResult(tuple(_source(path) for path in sorted(paths)),
                         tuple(map(printable, notes)))
 
 
-class _Search:
-    """Collects recordings and skipped paths."""
+def _real(path: Path) -> Path:
+    """Return a path with links resolved; a broken or circular link keeps its own name."""
+    real = Path(os.path.realpath(path))
+    return real if os.path.exists(real) else Path(os.path.realpath(path.parent)) / path.name
 
-    def __init__(self, leave_out: Path | None) -> None:
-        self.paths: set[Path] = set()
-        self._leave_out = leave_out
-        self._csv: list[Path] = []
-        self._logs: list[Path] = []
-        self._closed: list[str] = []
 
-    def add(self, path: Path) -> None:
-        path = path.parent if path.name == FILE else path
-        real = Path(os.path.realpath(path))
-        # A broken or circular link keeps its own name.
-        self.paths.add(real if os.path.exists(real) else
-                       Path(os.path.realpath(path.parent)) / path.name)
+def _candidates(root: Path, left_out: Path | None, closed: list[str]) -> Iterator[Path]:
+    """Yield the files and bags in a folder; describe folders that cannot be entered in closed."""
+    for folder, inner, names in _walk(root, lambda error: closed.append(
+            f"'{error.filename}' ({error.strerror})")):
+        here = Path(folder)
+        leave = here.resolve() == left_out
+        if leave or (here != root and _is_bag(here)):
+            inner.clear()
+            yield from () if leave else (here,)
+            continue
+        inner[:] = sorted(name for name in inner if not name.startswith('.'))
+        yield from (here / name for name in sorted(names))
 
-    def walk(self, root: Path) -> None:
-        """Search a folder; a bag in it is one recording."""
-        def closed(error: OSError) -> None:
-            self._closed.append(f"'{error.filename}' ({error.strerror})")
 
-        for folder, inner, names in _walk(root, closed):
-            here = Path(folder)
-            if self._leave_out is not None and here.resolve() == self._leave_out:
-                inner.clear()
-                continue
-            if here != root and _is_bag(here):
-                self.add(here)
-                inner.clear()
-                continue
-            inner[:] = sorted(name for name in inner if not name.startswith('.'))
-            for name in sorted(names):
-                self._file(here / name)
-
-    def _file(self, path: Path) -> None:
-        kind = path.suffix.lower()
-        if kind == '.mcap':
-            self.add(path)
-        elif kind == '.csv':
-            if _has_columns(path):
-                self.add(path)
-            else:
-                self._csv.append(path)
-        elif kind in _LOGS:
-            if is_log(path):
-                self.add(path)
-            elif kind not in _COMMON:
-                self._logs.append(path)
-
-    def notes(self) -> list[str]:
-        """Return what was skipped, one sentence per kind."""
-        found = []
-        if self._csv:
-            found.append(_skipped(self._csv, '.csv file', 'without columns of time and voltage'))
-        if self._logs:
-            found.append(_skipped(self._logs, 'file', 'with the ending of a log, but in no known '
-                                  'format'))
-        found += [f'The folder {text} cannot be searched.' for text in self._closed]
-        return found
+def _kind(path: Path) -> tuple[str, str] | None:
+    """Return None for a recording, else why it is skipped; empty: without a note."""
+    kind = path.suffix.lower()
+    if os.path.isdir(path) or kind == '.mcap':
+        return None
+    if kind == '.csv':
+        return None if _has_columns(path) else _CSV
+    if kind in _LOGS and is_log(path):
+        return None
+    return _LOG if kind in _LOGS and kind not in _COMMON else ('', '')
 
 
 def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
@@ -145,11 +129,6 @@ def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
             if onerror is not None:
                 onerror(OSError(0, f'its content is more than {_MOST_DEPTH} folders deep', folder))
         yield folder, inner, names
-
-
-def _skipped(paths: Sequence[Path], what: str, why: str) -> str:
-    many = '' if len(paths) == 1 else 's'
-    return f"{len(paths)} {what}{many} skipped, such as '{paths[0]}': {why}."
 
 
 def _is_bag(folder: Path) -> bool:

@@ -129,11 +129,10 @@ class Fleet:
 
 def run_fleet(found: SearchResult, folder: Path, options: Options, version: Callable[[], str], *,
               workers: int, scheduler: str | None = None, insecure: bool = False,
-              pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
-              comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
+              pattern: re.Pattern[str] | None = None, comparing: Progress | None = None,
+              progress: Progress | None = None) -> Fleet:
     """Analyse all unfinished recordings, and judge the fleet."""
-    saved = SavedResults(folder, {**asdict(options), **(stated_options or {}),
-                                  'version': version()})
+    saved = SavedResults(folder, {**asdict(options), 'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
     missing: list[FoundRecording] = []
