@@ -21,7 +21,8 @@ from ou_monitor.report.terminal import terminal
 from project import ROOT
 import pytest
 
-FLIGHT, GECKO = str(ROOT / 'bags/flight'), str(ROOT / 'bags/recorded/gecko_gyro.csv')
+FLIGHT, GECKO, SMALL = (str(ROOT / 'bags' / name) for name in (
+    'flight', 'recorded/gecko_gyro.csv', 'recorded/micromouse_3.csv'))
 PART = {'start': 0.0, 'end': 4.0}
 # Arguments of the command, and the same of the function.
 CALLS = {
@@ -63,12 +64,12 @@ def test_to_dict_is_the_json_of_the_command(name, found, tmp_path):
 
 
 def test_a_design_of_a_flight_has_its_facts(tmp_path):
-    assert main(['design', '--from', GECKO, '--throttle', '0.5', '--cells', '4', '--json',
+    assert main(['design', '--from', SMALL, '--throttle', '0.5', '--cells', '1', '--json',
                  str(tmp_path / 'x.json')]) == 0
-    result = design(0.5, recording=GECKO, network={'cells': 4})
+    result = design(0.5, recording=SMALL, network={'cells': 1})
     assert result.to_dict() == json.loads((tmp_path / 'x.json').read_text())
     # The default risk is that of the budget.
-    assert result.supply.to_dict() == supply_facts(read_recording(GECKO), limit=4 * 3.3).to_dict()
+    assert result.supply.to_dict() == supply_facts(read_recording(SMALL), limit=3.3).to_dict()
 
 
 def test_simulate_equals_the_command(tmp_path):
@@ -266,9 +267,9 @@ def test_a_model_without_throttle_writes_none(tmp_path):
 
 def test_times_of_compare_count_from_the_first_sample():
     """Stamps are dates; the second half is simulated."""
-    supply = read_recording(FLIGHT, end=20.0)
+    supply = read_recording(FLIGHT, **PART)
     dated = replace(supply, t=supply.t + 1.7e9)
     plot = compare(dated, seeds=20).plots()['Voltage, measured and simulated']
     low, high = (end(np.concatenate([curve.x for curve in plot.curves])) for end in (
         np.min, np.max))
-    assert (low, high) == pytest.approx((10.0, 20.0), abs=0.1)
+    assert (low, high) == pytest.approx((2.0, 4.0), abs=0.1)

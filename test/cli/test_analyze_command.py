@@ -3,7 +3,7 @@
 import math
 import re
 
-from command_line import failure, strict, write_csv
+from command_line import answer, failure, strict, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
@@ -20,19 +20,14 @@ def flight(tmp_path_factory):
     throttle = np.where(t < SECONDS, 0.1, 0.4)
     sigma = np.where(t < SECONDS, SIGMA[0.1], SIGMA[0.4])
     voltage = simulate(t, ALPHA, sigma, np.random.default_rng(1), u0=5.0 - 0.5 * throttle)
-    path = tmp_path_factory.mktemp('csv') / 'flight <b>.csv'
-    write_csv(path, t, voltage, throttle)
-    return path
+    return write_csv(tmp_path_factory.mktemp('csv') / 'flight <b>.csv', t, voltage, throttle)
 
 
 def test_json_on_standard_output_is_alone_and_true(flight, capsys):
     """Both levels, within 4 standard errors of the truth."""
     # T = 6 s: ln alpha and ln Var_inf scatter by sqrt(2/(63*6)) = 7.3 %; ln sigma by about
     # 1/sqrt(2*3000) = 1.3 %, 1.5 % with alpha unknown.
-    assert main(['analyze', str(flight), '--json', '-']) == 0
-    out, err = capsys.readouterr()
-    assert err == ''
-    data = strict(out)
+    data = answer(capsys, 'analyze', flight)
     assert (data['n'], data['recording']) == (6000, 'flight <b>.csv')
     assert [level['throttle'] for level in data['levels']] == pytest.approx([0.1, 0.4])
     for level in data['levels']:
@@ -63,10 +58,8 @@ def test_report_and_json_files(flight, tmp_path, capsys):
 
 def test_unknown_is_null(tmp_path, capsys):
     """A stuck sensor without throttle: status and nulls, exit status 0."""
-    path = tmp_path / 'stuck.csv'
-    write_csv(path, np.arange(100) / 100.0, np.full(100, 5.0))
-    assert main(['analyze', str(path), '--json', '-']) == 0
-    (level,) = strict(capsys.readouterr().out)['levels']
+    path = write_csv(tmp_path / 'stuck.csv', np.arange(100) / 100.0, np.full(100, 5.0))
+    (level,) = answer(capsys, 'analyze', path)['levels']
     assert level['throttle'] is None and level['sigma'] is None
     assert level['sigma_ci95'] == [None, None] and level['status'] == 'CONSTANT'
 
@@ -109,8 +102,8 @@ def test_bad_recordings_are_named(tmp_path, content, word, capsys):
 
 def test_levels_need_a_throttle(tmp_path, capsys):
     """--levels on a recording without throttle cannot be meant."""
-    path = tmp_path / 'plain.csv'
-    write_csv(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
+    k = np.arange(100)
+    path = write_csv(tmp_path / 'plain.csv', k / 100.0, 5.0 + 0.01 * np.sin(k))
     assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')
 
 
@@ -125,9 +118,7 @@ def test_a_horizon_asked_for_is_that_of_every_budget(flight, capsys):
 def test_a_part_is_analyzed_alone(flight, tmp_path, capsys):
     """Seconds 2 to 5: one level of 3 s; the page says so in its command."""
     report = tmp_path / 'part.html'
-    assert main(['analyze', str(flight), '--from', '2', '--to', '5', '--json', '-', '--report',
-                 str(report)]) == 0
-    found = strict(capsys.readouterr().out)
+    found = answer(capsys, 'analyze', flight, '--from', '2', '--to', '5', '--report', report)
     assert (found['n'], len(found['levels'])) == (1500, 1)
     assert found['levels'][0]['throttle'] == pytest.approx(0.1)
     assert '--from 2 --to 5' in report.read_text(encoding='utf-8')
@@ -137,21 +128,17 @@ def test_a_part_is_analyzed_alone(flight, tmp_path, capsys):
 def test_the_default_of_a_5_v_rail_is_for_one(tmp_path, capsys):
     """A battery of four cells gets no risk against 4.5 V, and the reason."""
     rng = np.random.default_rng(3)
-    path = tmp_path / 'a.csv'
-    path.write_text('time_s,voltage_v\n' + ''.join(
-        f'{k * 1e-3:.3f},{15.0 + 0.05 * u:.5f}\n'
-        for k, u in enumerate(rng.standard_normal(2000).cumsum() * 0.03)))
+    path = write_csv(tmp_path / 'a.csv', 1e-3 * np.arange(2000),
+                     15.0 + 0.0015 * rng.standard_normal(2000).cumsum())
     assert main(['analyze', str(path)]) == 0
     said = ' '.join(capsys.readouterr().out.split())
     assert 'Safe up to unknown: no limit; --brownout-voltage or --cells sets one' in said
     # With a throttle it may be a craft, whose limit is suggested.
-    craft = tmp_path / 'craft.csv'
-    craft.write_text('time_s,voltage_v,throttle\n' + ''.join(
-        f'{k * 0.02:.2f},{15.9 - u + 0.01 * noise:.3f},{u}\n' for k, (u, noise) in enumerate(zip(
-            np.repeat(rng.uniform(0.1, 0.9, 40), 25).round(2), rng.standard_normal(1000)))))
+    u = np.repeat(rng.uniform(0.1, 0.9, 40), 25).round(2)
+    craft = write_csv(tmp_path / 'craft.csv', 0.02 * np.arange(1000),
+                      15.9 - u + 0.01 * rng.standard_normal(1000), u)
     assert main(['analyze', str(craft)]) == 0
     said = ' '.join(capsys.readouterr().out.split())
     assert '--cells 4 (a guess from the voltage) sets it to 13.2 V (empty under load)' in said
-    assert main(['analyze', str(path), '--brownout-voltage', '14', '--json', '-']) == 0
-    found = strict(capsys.readouterr().out)
+    found = answer(capsys, 'analyze', path, '--brownout-voltage', '14')
     assert found['brownout']['voltage'] == 14.0 and 0.0 <= found['sliding']['brownout_risk'][-1]

@@ -1,9 +1,8 @@
 """`ou-monitor compare`: its sentence, table, JSON and page, and errors."""
 
-import json
 from xml.etree import ElementTree
 
-from command_line import failure
+from command_line import answer, failure, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.supply import SupplyModel
@@ -32,9 +31,8 @@ def folder(tmp_path_factory):
     t = np.arange(2000) / 50.0
     u = np.random.default_rng(1).random(30)[(t / 1.5).astype(int)]
     v = MODEL.simulate(t, np.random.default_rng(2), u)
-    for name, columns in (('my flight', [t, v, u]), ('bench', [t, v])):
-        np.savetxt(path / f'{name}.csv', np.column_stack(columns), '%.6g', ',', comments='',
-                   header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))
+    write_csv(path / 'my flight.csv', t, v, u)
+    write_csv(path / 'bench.csv', t, v)
     (path / 'model.yaml').write_text(as_yaml(ModelFile(MODEL)), encoding='utf-8')
     wrong = SupplyModel((OU(20.0, 0.6, 15.0), LoadSag(1.5, 0.0)))
     (path / 'wrong.yaml').write_text(as_yaml(ModelFile(wrong)), encoding='utf-8')
@@ -60,10 +58,7 @@ def check(data, shape, where='$'):
 def test_json_has_the_documented_keys(folder, capsys, name, options, monkeypatch):
     """Names and types, with a model, without, and without throttle."""
     monkeypatch.chdir(folder)
-    assert main(['compare', f'{name}.csv', '--seeds', '20', '--json', '-', *options]) == 0
-    out, err = capsys.readouterr()
-    data = json.loads(out)
-    assert err == ''
+    data = answer(capsys, 'compare', f'{name}.csv', '--seeds', '20', *options)
     # Section 11: test_supply_in_json.py.  Steps of an unknown load look like a slow OU.
     assert data.pop('supply')['ou']['status'] == ('too_short' if name == 'bench' else 'ok')
     check(data, CONTRACT)

@@ -1,8 +1,6 @@
 """`ou-monitor coupling`: columns and topics in; table and JSON out; one line for bad input."""
 
-import json
-
-from command_line import failure
+from command_line import answer, failure
 from made_bags import encode
 from made_logs import blackbox
 import numpy as np
@@ -75,11 +73,7 @@ def bag(series, tmp_path_factory):
 
 
 def found(capsys, *argv):
-    """Run; return the JSON."""
-    assert main(['coupling', *map(str, argv), '--json', '-']) == 0
-    out, err = capsys.readouterr()
-    assert err == ''
-    return json.loads(out)
+    return answer(capsys, 'coupling', *argv)
 
 
 def test_column_and_field_path_say_the_same(table, bag, capsys):
@@ -155,10 +149,6 @@ def test_the_page_says_what_the_text_says(table, tmp_path, capsys):
     (['--signal', 'gyro_x', '--json', '/nowhere/x.json'], '/nowhere'),
 ])
 def test_bad_input_is_one_line(table, options, words, capsys):
-    if not options:
-        assert main(['coupling', str(table)]) == 2
-        assert words in capsys.readouterr().err
-        return
     assert words in failure(capsys, 'coupling', table, *options)
 
 

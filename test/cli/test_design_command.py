@@ -5,6 +5,7 @@ import json
 import math
 import re
 
+from command_line import answer, failure, write_csv
 import numpy as np
 from ou_monitor.cli.commands import quantity
 from ou_monitor.cli.main import main
@@ -16,20 +17,14 @@ from scipy import stats
 QUESTION = ['design', '--risk', '1e-3', '--throttle', '0.4']
 
 
-def said(capsys, *more):
-    """Return what a run that succeeds prints."""
-    assert main([*QUESTION, *more]) == 0
-    out, err = capsys.readouterr()
-    assert err == ''
-    return out
-
-
 def told(capsys, *more):
-    """Return the JSON of a run; NaN and Infinity are errors."""
-    def refuse(word):
-        raise ValueError(f'{word} is not JSON')
+    """Return the JSON of the question, with more options."""
+    return answer(capsys, *QUESTION, *more)
 
-    return json.loads(said(capsys, '--json', '-', *more), parse_constant=refuse)
+
+def asked(capsys, *words):
+    """Return the JSON of `design`."""
+    return answer(capsys, 'design', *words)
 
 
 def test_json_and_table_agree(capsys, tmp_path):
@@ -40,7 +35,8 @@ def test_json_and_table_agree(capsys, tmp_path):
     assert data['least']['alpha'] < data['present']['alpha']
     assert data['network']['bulk_capacitance'] == 470e-6
     file = tmp_path / 'design.json'
-    assert data['answer'] in said(capsys, '--json', str(file))
+    assert main([*QUESTION, '--json', str(file)]) == 0
+    assert data['answer'] in capsys.readouterr().out
     assert json.loads(file.read_text(encoding='utf-8')) == data
 
 
@@ -72,16 +68,13 @@ def test_list_shows_every_component_with_its_unit(capsys):
     assert re.search(r'^bulk_capacitance +0.00047  F$', out, re.MULTILINE)
     assert re.search(r'^line_gain +0.225225$', out, re.MULTILINE)
     assert len(out.splitlines()) == 2 + len(PowerNetwork.__dataclass_fields__)
-    assert main(['design', '--list', '--json', '-']) == 0
-    values = json.loads(capsys.readouterr().out)
+    values = asked(capsys, '--list')
     assert values['bulk_capacitance'] == {'default': 470e-6, 'unit': 'F'}
     assert values.keys() == PowerNetwork.__dataclass_fields__.keys()
 
 
-@pytest.mark.parametrize('given, missing', [('--risk=1e-3', '--throttle')])
-def test_missing_options_are_named(capsys, given, missing):
-    assert main(['design', given]) == 2
-    assert re.match(rf'.*{missing} is missing', capsys.readouterr().err)
+def test_a_missing_throttle_is_named(capsys):
+    assert '--throttle is missing' in failure(capsys, 'design', '--risk=1e-3')
 
 
 @pytest.mark.parametrize('more, words', [
@@ -105,9 +98,7 @@ def test_missing_options_are_named(capsys, given, missing):
 ])
 def test_bad_input_is_one_line(more, words, capsys):
     """Status 2, one line that names what to mend, nothing on standard output."""
-    assert main([*QUESTION, *more]) == 2
-    out, err = capsys.readouterr()
-    assert out == '' and err.count('\n') == 1 and words in err
+    assert words in failure(capsys, *QUESTION, *more)
 
 
 @pytest.mark.parametrize('text, words', [
@@ -119,9 +110,8 @@ def test_bad_input_is_one_line(more, words, capsys):
 def test_bad_network_files_are_one_line(text, words, capsys, tmp_path):
     file = tmp_path / 'frame.yaml'
     file.write_bytes(text)
-    assert main([*QUESTION, '--network', str(file)]) == 2
-    out, err = capsys.readouterr()
-    assert out == '' and err.count('\n') == 1 and words in err and 'frame.yaml' in err
+    said = failure(capsys, *QUESTION, '--network', file)
+    assert words in said and 'frame.yaml' in said
 
 
 @pytest.mark.parametrize('text, unit, value', [
@@ -143,20 +133,11 @@ def test_invalid_quantities_are_refused(text):
 def flight(tmp_path_factory):
     """Return a flight of a 4S craft of 25 mOhm that draws 80 A at full throttle, noise 30 mV."""
     rng = np.random.default_rng(5)
-    t = np.arange(5000) / 100.0
+    t = np.arange(2500) / 50.0
     u = 0.45 + 0.35 * np.sin(t / 1.3) * np.sin(t / 7.1)
     amps = 80.0 * u ** 1.5
     volts = 16.2 - 0.025 * amps + 0.03 * rng.standard_normal(t.size)
-    path = tmp_path_factory.mktemp('flown') / 'flight.csv'
-    path.write_text('time_s,voltage_v,throttle,current_a\n' + ''.join(
-        f'{a:.4f},{b:.4f},{c:.4f},{d:.3f}\n' for a, b, c, d in zip(t, volts, u, amps)))
-    return path
-
-
-def asked(capsys, *words):
-    """Return the JSON of `design`."""
-    assert main(['design', *map(str, words), '--json', '-']) == 0
-    return json.loads(capsys.readouterr().out)
+    return write_csv(tmp_path_factory.mktemp('flown') / 'flight.csv', t, volts, u, amps)
 
 
 def test_a_flight_gives_the_network(flight, capsys):
@@ -176,12 +157,11 @@ def test_a_flight_gives_the_network(flight, capsys):
 def test_an_unknown_sag_is_not_designed_with(tmp_path, capsys):
     """As of a stand whose inrush hides the sag: `analyze` calls it unknown too."""
     rng = np.random.default_rng(1)
-    path = tmp_path / 'a.csv'
-    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
-        f'{k / 100.0:.2f},{16.0 + 0.3 * rng.standard_normal():.4f},{0.4 + 0.01 * (k > 150)}\n'
-        for k in range(200)))
-    assert main(['design', '--from', str(path), '--set', 'cells=4', '--throttle', '0.4']) == 2
-    assert 'the sag of a.csv is unknown' in capsys.readouterr().err
+    k = np.arange(200)
+    path = write_csv(tmp_path / 'a.csv', k / 100.0, 16.0 + 0.3 * rng.standard_normal(k.size),
+                     0.4 + 0.01 * (k > 150))
+    assert 'the sag of a.csv is unknown' in failure(
+        capsys, 'design', '--from', path, '--set', 'cells=4', '--throttle', '0.4')
 
 
 def test_set_values_override_the_flight(flight, capsys):
@@ -191,8 +171,7 @@ def test_set_values_override_the_flight(flight, capsys):
     assert found['brownout_voltage'] == pytest.approx(12.8)
     assert found['network']['battery_resistance'] == 0.05
     assert found['present']['sag'] == pytest.approx(0.05 * 80.0 * 0.5 ** 1.5, rel=0.15)
-    assert main(['design', '--from', str(flight), '--set', 'cells=3']) == 2
-    assert 'it is likely 4' in capsys.readouterr().err
+    assert 'it is likely 4' in failure(capsys, 'design', '--from', flight, '--set', 'cells=3')
 
 
 def rail(tmp_path, volts, sag, rms, amperes=None):
@@ -200,13 +179,8 @@ def rail(tmp_path, volts, sag, rms, amperes=None):
     rng = np.random.default_rng(2)
     u = np.repeat(rng.uniform(0.0, 1.0, 80), 50)
     v = volts - sag * u + rms * rng.standard_normal(u.size)
-    columns = {'time_s': np.arange(u.size) / 100.0, 'voltage_v': v, 'throttle': u}
-    if amperes is not None:
-        columns['current_a'] = amperes * u
-    path = tmp_path / 'rail.csv'
-    np.savetxt(path, np.column_stack(list(columns.values())), '%.5f', ',', comments='',
-               header=','.join(columns))
-    return path
+    return write_csv(tmp_path / 'rail.csv', np.arange(u.size) / 100.0, v, u,
+                     None if amperes is None else amperes * u)
 
 
 def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
@@ -217,9 +191,8 @@ def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
     assert found['present']['mean'] == pytest.approx(5.02 - 0.06 * found['throttle'], abs=0.005)
     assert math.sqrt(found['present']['var_inf']) == pytest.approx(0.009, rel=0.2)
     assert found['network']['cells'] == 0 and 'packs' not in str(found)
-    assert main(['design', '--from', str(path), '--cells', '1']) == 2
-    err = capsys.readouterr().err
-    assert 'no number of charged lithium cells fits; for lead-acid, or a rail' in err
+    assert 'no number of charged lithium cells fits; for lead-acid, or a rail' in failure(
+        capsys, 'design', '--from', path, '--cells', '1')
 
 
 @pytest.mark.parametrize('volts, level, said', [
@@ -235,8 +208,8 @@ def test_a_recorded_rail_is_the_source(volts, level, said, tmp_path, capsys):
         # It may as well be a pack, so only the user knows.
         assert 'guessed' not in asked(capsys, '--from', path, '--cells', '3')[
             'brownout_voltage_source']
-        assert main(['design', '--from', str(path), '--set', 'cells=0']) == 2
-        assert 'for a rail of 12 V' in capsys.readouterr().err
+        assert 'for a rail of 12 V' in failure(
+            capsys, 'design', '--from', path, '--set', 'cells=0')
         found = asked(capsys, '--from', path, '--set', 'cells=0', '--voltage', '11.5')
     network, present = found['network'], found['present']
     assert (network['cells'], network['regulator_voltage']) == (0, 0.0)
@@ -253,28 +226,24 @@ def test_a_measured_current_is_the_load(tmp_path, capsys):
     """A rail of 0.1 Ohm without a throttle: the answer is that of the current as throttle."""
     rng = np.random.default_rng(2)
     amps = np.repeat(2.0 * rng.uniform(0.0, 1.0, 80), 50)
-    path = tmp_path / 'rail.csv'
-    path.write_text('time_s,voltage_v,current_a\n' + ''.join(
-        f'{k / 50.0:.2f},{5.0 - 0.1 * one + 0.003 * noise:.5f},{one:.4f}\n'
-        for k, (one, noise) in enumerate(zip(amps, rng.standard_normal(amps.size)))))
+    path = write_csv(tmp_path / 'rail.csv', np.arange(amps.size) / 50.0, 5.0 - 0.1 * amps
+                     + 0.003 * rng.standard_normal(amps.size), current=amps)
     found = asked(capsys, '--from', path)
     assert f'current over its largest, {amps.max():.3g} A' in found['measured']
     assert found['network']['battery_resistance'] == pytest.approx(0.1, rel=0.1)
     assert found['present']['sag'] == pytest.approx(
         0.1 * amps.max() * found['throttle'], rel=0.1)
-    assert main(['design', '--from', str(path), '--current-column', 'none']) == 2
-    assert 'no throttle and no current' in capsys.readouterr().err
+    assert 'no throttle and no current' in failure(
+        capsys, 'design', '--from', path, '--current-column', 'none')
 
 
 def test_the_sag_of_a_small_pack_is_the_recorded_one(tmp_path, capsys):
     """The current of its regulator is in the recording, and full throttle has noise too."""
     rng = np.random.default_rng(4)
     u = np.tile(np.repeat([0.2, 0.6, 1.0, 0.4, 0.8], 100), 8)
-    path = tmp_path / 'micro.csv'
-    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
-        f'{k / 100.0:.2f},{4.0 - 0.4 * one + 0.006 * noise:.5f},{one:.3f}\n'
-        for k, (one, noise) in enumerate(zip(u, rng.standard_normal(u.size)))))
-    found = asked(capsys, '--from', path)
+    volts = 4.0 - 0.4 * u + 0.006 * rng.standard_normal(u.size)
+    found = asked(capsys, '--from', write_csv(
+        tmp_path / 'micro.csv', np.arange(u.size) / 100.0, volts, u))
     sag = dict(zip(found['supply']['sag']['throttle'], found['supply']['sag']['sag_v']))
     assert found['throttle'] == 1.0
     assert found['present']['sag'] == pytest.approx(sag[1.0], rel=1e-9)
@@ -385,13 +354,10 @@ def test_a_row_of_a_network_is_the_run_with_that_value(resistance, capsys):
 
 
 @pytest.mark.parametrize('limit, risk', [(14.9, 0.01), (14.9, 0.05), (16.15, 0.01)])
-def test_the_throttle_limit_is_the_budget_of_analyze(limit, risk, flight, tmp_path, capsys):
+def test_the_throttle_limit_is_the_budget_of_analyze(limit, risk, flight, capsys):
     """One answer of both commands, and the one facts of a supply."""
     found = asked(capsys, '--from', flight, '--voltage', limit, '--risk', risk)
-    assert main(['analyze', str(flight), '--brownout-voltage', str(limit), '--json',
-                 str(tmp_path / 'a')]) == 0
-    capsys.readouterr()
-    supply = json.loads((tmp_path / 'a').read_text())['supply']
+    supply = answer(capsys, 'analyze', flight, '--brownout-voltage', limit)['supply']
     budget = found['supply']['budget']
     if risk == budget['risk'] == supply['budget']['risk']:
         assert found['supply'] == supply

@@ -5,7 +5,7 @@ import json
 import re
 from xml.etree import ElementTree
 
-from command_line import failure, strict, write_csv
+from command_line import answer, failure, strict, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
@@ -32,16 +32,12 @@ def flight(tmp_path_factory):
     t = np.arange(3000) / 500.0
     u = np.repeat(rng.random(15), 200)
     v = SupplyModel((OU(63.0, 0.3156, 5.0), LoadSag(0.6, 0.0))).simulate(t, rng, u)
-    path = tmp_path_factory.mktemp('csv') / 'my flight.csv'
-    write_csv(path, t, v, u)
-    return path
+    return write_csv(tmp_path_factory.mktemp('csv') / 'my flight.csv', t, v, u)
 
 
 def test_json_on_standard_output_is_alone(flight, capsys):
-    assert main(['discover', str(flight), '--json', '-']) == 0
-    out, err = capsys.readouterr()
-    data = strict(out)
-    assert err == '' and data['n'] == 3000 and data['recording'] == 'my flight.csv'
+    data = answer(capsys, 'discover', flight)
+    assert data['n'] == 3000 and data['recording'] == 'my flight.csv'
     assert data['verdict'] == 'explained'
     assert [cause['name'] for cause in data['causes']] == ['load_sag']
     assert data['extended']['gain'] == pytest.approx(
@@ -51,8 +47,7 @@ def test_json_on_standard_output_is_alone(flight, capsys):
 def test_a_part_is_read_and_said_again(flight, tmp_path, capsys, monkeypatch):
     page = tmp_path / 'a.html'
     part = ['--from', '2', '--to', '2.2']
-    assert main(['discover', str(flight), *part, '--json', '-', '--report', str(page)]) == 0
-    data = strict(capsys.readouterr().out)
+    data = answer(capsys, 'discover', flight, *part, '--report', page)
     assert data['n'] == 100 and data['duration_s'] == pytest.approx(0.198)
     assert '--from 2 --to 2.2' in page.read_text()
     assert "--from: 'x'" in failure(capsys, 'discover', flight, '--from', 'x')
@@ -141,9 +136,7 @@ def test_the_answer_begins_with_the_largest_gains():
     (['--save-model', '-'], '--save-model'), (['--json', '/no/such/folder/x.json'], 'folder'),
     (['--msg-config', 'px4'], 'CSV'), (['--reprot', 'x'], '--report')])
 def test_bad_options_are_one_line(flight, capsys, words, part):
-    assert main(['discover', str(flight), *words]) == 2
-    out, err = capsys.readouterr()
-    assert out == '' and part in err and err.count('\n') == 1
+    assert part in failure(capsys, 'discover', flight, *words)
 
 
 def test_bad_recordings_are_one_line(tmp_path, capsys):
@@ -171,12 +164,9 @@ def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
     rng = np.random.default_rng(4)
     t = np.arange(3000) / 50.0
     amps = np.repeat(rng.uniform(1.0, 40.0, 60), 50)
-    path = tmp_path / 'a.csv'
-    path.write_text('time_s,voltage_v,current_a\n' + ''.join(
-        f'{a:.3f},{16.0 - 0.03 * i + 0.01 * e:.4f},{i:.2f}\n'
-        for a, i, e in zip(t, amps, rng.standard_normal(t.size))))
-    model = tmp_path / 'm.yaml'
-    data = tmp_path / 'a.json'
+    path = write_csv(tmp_path / 'a.csv', t, 16.0 - 0.03 * amps
+                     + 0.01 * rng.standard_normal(t.size), current=amps)
+    model, data = tmp_path / 'm.yaml', tmp_path / 'a.json'
     assert main(['discover', str(path), '--save-model', str(model), '--json', str(data)]) == 2
     out, err = capsys.readouterr()
     assert 'no model saved: its load is the measured current' in err and str(model) not in out

@@ -1,4 +1,4 @@
-"""Helpers for the tests of commands: write a CSV, read strict JSON, expect a failure."""
+"""Helpers for the tests of commands: write a CSV, run, read strict JSON, expect a failure."""
 
 import json
 import re
@@ -7,10 +7,13 @@ import numpy as np
 from ou_monitor.cli.main import main
 
 
-def write_csv(path, t, voltage, throttle=None):
-    columns = [t, voltage] if throttle is None else [t, voltage, throttle]
-    np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
-               header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))
+def write_csv(path, t, voltage, throttle=None, current=None):
+    """Write a recording, s, V, 0..1, A; return its path."""
+    columns = {'time_s': t, 'voltage_v': voltage, 'throttle': throttle, 'current_a': current}
+    known = {name: column for name, column in columns.items() if column is not None}
+    np.savetxt(path, np.column_stack(list(known.values())), '%.9g', ',', comments='',
+               header=','.join(known))
+    return path
 
 
 def strict(text):
@@ -19,6 +22,14 @@ def strict(text):
         raise ValueError(f'{word} is not JSON')
 
     return json.loads(text, parse_constant=refuse)
+
+
+def answer(capsys, *argv):
+    """Run a command; return its JSON, which stands alone on standard output."""
+    assert main([*map(str, argv), '--json', '-']) == 0
+    out, err = capsys.readouterr()
+    assert err == ''
+    return strict(out)
 
 
 def failure(capsys, *argv):
