@@ -1,11 +1,10 @@
 """One set of supply facts: two commands, a row of the fleet and the node give equal numbers."""
 
-import json
 import math
 
+from command_line import answer
 import numpy as np
 from ou_monitor import MonitorSettings, read_recording, SupplyMonitor
-from ou_monitor.cli.main import main
 from ou_monitor.fleet.analysis import Options, work
 from project import REAL, ROOT
 import pytest
@@ -36,22 +35,13 @@ def part_of(path, part, folder):
     return table, read_recording(table)
 
 
-def said(command, path, limit, folder, *more):
-    """Return what a command says; None where it refuses so little in one line."""
-    target = folder / f'{command}.json'
-    status = main([command, str(path), '--brownout-voltage', str(limit), '--json', str(target),
-                   *more])
-    assert status == (0 if target.exists() else 2)
-    return json.loads(target.read_text()) if target.exists() else None
-
-
-@pytest.mark.parametrize('name, limit, end, others', [
-    ('flight', 4.6, '3', {'compare': ('--seeds', '20'), 'discover': ()}),
-    ('recorded/gecko_gyro.csv', 15.5, '6', {'coupling': ('--signal', 'gyro_x_deg_s')})])
-def test_all_commands_give_the_same_object(name, limit, end, others, tmp_path):
-    part = ROOT / 'bags' / name, limit, tmp_path, '--from', '0', '--to', end
-    supply = said('analyze', *part)['supply']
-    assert all(said(one, *part, *more)['supply'] == supply for one, more in others.items())
+@pytest.mark.parametrize('name, limit, end, command, more', [
+    ('flight', 4.6, 3, 'discover', ()),
+    ('recorded/gecko_gyro.csv', 15.5, 6, 'coupling', ('--signal', 'gyro_x_deg_s'))])
+def test_a_command_gives_the_object_of_analyze(name, limit, end, command, more, capsys):
+    part = ROOT / 'bags' / name, '--brownout-voltage', limit, '--from', 0, '--to', end
+    supply = answer(capsys, 'analyze', *part)['supply']
+    assert answer(capsys, command, *part, *more)['supply'] == supply
     assert supply['dips']['limit_v'] == limit and supply['budget']['throttle'] > 0.0
 
 
@@ -62,14 +52,14 @@ def near(found, wanted, tolerance=0.0):
 
 
 @pytest.mark.parametrize('path, limit, part', RECORDINGS, ids=lambda x: getattr(x, 'stem', ''))
-def test_commands_fleet_and_node_agree_on_the_facts(path, limit, part, tmp_path):
+def test_commands_fleet_and_node_agree_on_the_facts(path, limit, part, tmp_path, capsys):
     if not path.exists():
         pytest.skip('OU_MONITOR_REALDATA is not set')
     table, recording = part_of(path, part, tmp_path)
-    analysis = said('analyze', table, limit, tmp_path)
+    given = table, '--brownout-voltage', limit
+    analysis = answer(capsys, 'analyze', *given)
     supply = analysis['supply']
-    compared = said('compare', table, limit, tmp_path, '--seeds', '5')
-    assert compared is None or compared['supply'] == supply
+    assert answer(capsys, 'compare', *given, '--seeds', 20)['supply'] == supply
     row = work(str(table), Options(brownout_voltage=limit))
     assert row['supply'] == supply
     for column, wanted in (
