@@ -438,7 +438,7 @@ _LIVE = Command(
     (Option('--host', metavar='ADDRESS', default='127.0.0.1',
             help='address to listen on (default: %(default)s); any other requires the printed '
             'token'),
-     Option('--port', metavar='N', default='8765',
+     Option('--port', metavar='N', default=8765, type=whole('a port, 0 to 65535', 0, 65535),
             help='port; 0: any that is free (default: %(default)s)'),
      Option('--estimator', metavar='NODE', default='/ou_estimator',
             help='name of the estimator (default: %(default)s)'),

@@ -197,7 +197,7 @@ class MonitorNode(Node):
         return call
 
     def _take_fault(self, error: Exception) -> None:
-        words = ' '.join(str(error).split())[:200]
+        words = one_line(error)[:200]
         self.fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
         self.faults += 1
         self._faulted = self.steady_now()

@@ -40,7 +40,6 @@ _ALIVE = 5.0
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    port = _port(args.port)
     if not args.host:
         raise InputError('--host: the address is empty; 0.0.0.0 listens on all')
     try:
@@ -49,13 +48,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"live needs tornado: {how_to_install('live')}") from error
     # Names of nodes with the leading slash that ROS writes.
     names = [f"/{name.strip('/')}" for name in (args.estimator, args.filter)]
-    return run_ros(NAME, lambda: _serve(args.host, port, *names), [])
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) <= _DIGITS and int(text) <= 65535):
-        raise InputError(f"--port: '{text}' is not a port, 0 to 65535 (0: any that is free)")
-    return int(text)
+    return run_ros(NAME, lambda: _serve(args.host, args.port, *names), [])
 
 
 def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:

@@ -292,13 +292,13 @@ def _curves(analysis: Analysis) -> list[Part]:
     if math.isnan(found.noise.flown[0]):
         return []
     x = 100.0 * np.array(found.sag.throttle)
-    answer, error = 1e3 * _column(found.sag.sag_v), 2e3 * _column(found.sag.se_v)
+    answer, error = 1e3 * np.array(found.sag.sag_v), 2e3 * np.array(found.sag.se_v)
     sag = _empty('Sag', 'mV').band(x, np.maximum(answer - error, 0.0), answer + error, '95 %', 0)
     sag.line(x, answer, 'estimate', 0, 'thick')
     noise = _empty('Noise', 'mV rms')
     for values, label, colour in ((found.noise.rms_v, 'all samples', 0),
                                   (found.noise.steady_rms_v, 'steady throttle', 2)):
-        rms = np.where(learned.known, 1e3 * _column(values), NAN)
+        rms = np.where(learned.known, 1e3 * np.array(values), NAN)
         noise.line(x, rms, label, colour, 'thick').markers(x, rms, '', colour)
     highest = np.nanmax(np.concatenate([[1e-6], *(curve.y for curve in noise.curves)]))
     noise.limits(y=(0.0, 1.1 * float(highest)))
@@ -319,24 +319,20 @@ def _empty(title: str, unit: str, log: bool = False) -> Plot:
         x=(-2.0, 102.0))
 
 
-def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArray:
-    return np.array(values, dtype=np.float64)
-
-
 def _fits(analysis: Analysis) -> list[Part]:
     levels = [level for level in analysis.levels
               if math.isfinite(level.throttle) and level.estimate.usable]
     if len(levels) < 2:
         return []
-    x = _column([100.0 * level.throttle for level in levels])
+    x = np.array([100.0 * level.throttle for level in levels])
     sigma = _empty('Noise intensity \u03c3', 'V/\u221as')
     alpha = _empty('Relaxation rate \u03b1', '1/s')
     least, most = analysis.alpha_test.interval
     alpha.band(np.array([0.0, 100.0]), np.full(2, least), np.full(2, most), 'all levels, 95 %', 2)
     for plot, name in ((sigma, 'sigma'), (alpha, 'alpha')):
-        low, high = _column([level.estimate.interval(name) for level in levels]).T
+        low, high = np.array([level.estimate.interval(name) for level in levels]).T
         plot.bars(x, low, high, '', 7).markers(
-            x, _column([getattr(level.estimate, name) for level in levels]), 'load levels', 7)
+            x, np.array([getattr(level.estimate, name) for level in levels]), 'load levels', 7)
     return [Pair([Figure(sigma), Figure(alpha)])]
 
 

@@ -4,7 +4,7 @@ import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from live import diagnosis, ou_path, values_of, wait_until
+from live import diagnosis, ou_path, seconds, values_of, wait_until
 from made_devices import attributes, iio_device, OFFSET, SCALE, scans
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_hwmon_publishes_battery_states(world, tmp_path):
                       'offset:=0.5', '-p', f'sysfs:={tmp_path}/sys')
     wait_until(lambda: len(got) >= 50)
     assert got[-1].voltage == pytest.approx(15.5) and np.isnan(got[-1].percentage)
-    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in got]
+    stamps = [seconds(m.header.stamp) for m in got]
     # A busy machine asks late; what was late does not make the next one early by more.
     assert (stamps[-1] - stamps[0]) / (len(stamps) - 1) > 0.0095
     assert abs(stamps[-1] - time.time()) < 60.0

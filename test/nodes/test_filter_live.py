@@ -4,57 +4,38 @@ import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from live import diagnosis, values_of, wait_until
+from live import LowPass, to_stamp, values_of, wait_until
 from ou_monitor.online.filter.cutoff_laws import relative_cutoff
 from ou_monitor.online.filter.filter_state import phase_lag
 import pytest
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64
 
-NODE = '/ou_adaptive_filter'
-NAME = 'ou_adaptive_filter: adaptive low-pass'
 # What constant_noise asks for at twice sigma_ref and 1 kHz; it looks at the rate to 5 %.
 HELD, CLOSE = relative_cutoff('lowpass', 2, 150.0, 2.0, 1e-3), 0.02
 
 
-class Rig:
+class Rig(LowPass):
     """The filter, with a sigma and an IMU."""
 
     def __init__(self, world):
-        self.probe = world.probe()
-        self.output = self.probe.listen(f'{NODE}/output', Imu)
-        self.cutoff = self.probe.listen(f'{NODE}/cutoff', Float64)
-        self.lag = self.probe.listen(f'{NODE}/lag', Float64)
-        self.diagnostics = self.probe.listen('/diagnostics', DiagnosticArray)
-        self.sigma = self.probe.publisher('/sigma', Float64)
-        self.state = self.probe.publisher('/state', DiagnosticArray)
-        self.input = self.probe.publisher('/input', Imu)
-        self.process = world.start('adaptive_filter', '--ros-args', '-p', 'smoothing:=0.0',
-                                   '-p', 'slew:=0.0')
-        wait_until(lambda: self.sigma.get_subscription_count()
-                   and self.state.get_subscription_count()
-                   and self.input.get_subscription_count(), what='subscriptions')
-        # Both ends must know of each other before the first message.
-        wait_until(lambda: self.probe.node.count_publishers(f'{NODE}/output'))
-        time.sleep(0.3)
+        super().__init__(world, {'sigma': Float64, 'state': DiagnosticArray},
+                         '-p', 'smoothing:=0.0', '-p', 'slew:=0.0')
         self.stamp = 100.0
 
     def send(self, rate, dt=0.001):
         """Send one stamped IMU message."""
         self.stamp += dt
         message = Imu()
-        message.header.frame_id = 'imu'
-        message.header.stamp.sec = int(self.stamp)
-        message.header.stamp.nanosec = round(self.stamp % 1.0 * 1e9) % 10**9
+        message.header.frame_id, message.header.stamp = 'imu', to_stamp(self.stamp)
         message.linear_acceleration.z = 9.81
         gyro = message.angular_velocity
         gyro.x, gyro.y, gyro.z = rate
-        self.input.publish(message)
+        self.inputs['input'].publish(message)
         return message
 
-    @property
-    def status(self):
-        return diagnosis(self.diagnostics, NAME)
+    def send_sigma(self, sigma):
+        self.inputs['sigma'].publish(Float64(data=sigma))
 
 
 @pytest.fixture(scope='module')
@@ -66,7 +47,7 @@ def drive(rig, sigma, seconds=0.5):
     """Keep sigma and the input alive for a while."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
-        rig.sigma.publish(Float64(data=sigma))
+        rig.send_sigma(sigma)
         rig.send((0.0, 0.0, 0.0))
         time.sleep(0.01)
 
@@ -112,7 +93,7 @@ def test_the_lag_is_published(rig):
 
 
 def test_shadow_lets_the_signal_pass(rig):
-    assert rig.probe.set_parameter(NODE, 'shadow', True).successful
+    assert rig.set('shadow', True).successful
     drive(rig, 0.6, 0.5)
     before = len(rig.output)
     rig.send((2.0, 0.0, 0.0))
@@ -124,7 +105,7 @@ def test_shadow_lets_the_signal_pass(rig):
         drive(rig, 0.1, 0.1)
         return rig.status.message.startswith('Shadow, the signal passes unfiltered: Cutoff')
     wait_until(told, what='shadow in the diagnostics')
-    assert rig.probe.set_parameter(NODE, 'shadow', False).successful
+    assert rig.set('shadow', False).successful
 
 
 def test_a_slow_input_warns(rig):
@@ -133,7 +114,7 @@ def test_a_slow_input_warns(rig):
         for _ in range(50):
             rig.send((0.0, 0.0, 0.0), dt=0.1)
             time.sleep(0.001)
-        rig.sigma.publish(Float64(data=0.6))
+        rig.send_sigma(0.6)
         return 'are too slow: 0.45 of their rate is 4.5 Hz' in rig.status.message
     wait_until(told, what='WARN')
     assert rig.status.level == b'\x01'
@@ -173,11 +154,11 @@ def test_bad_samples_are_counted_and_not_passed_on(rig):
 
 def test_parameters_change_at_run_time_or_are_refused(rig):
     for name, value in (('fmax', 200.0), ('fmin', 10.0), ('fallback', 50.0), ('order', 1)):
-        result = rig.probe.set_parameter(NODE, name, value)
+        result = rig.set(name, value)
         assert result.successful, result.reason
     for name, value, words in (('fmin', 300.0, 'fmin'), ('order', 3, ''), (
             'law', 'treshold', 'threshold'), ('mode', 'derivative', 'read-only')):
-        refused = rig.probe.set_parameter(NODE, name, value)
+        refused = rig.set(name, value)
         assert not refused.successful and words in refused.reason
 
 

@@ -2,40 +2,24 @@
 
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray
-from live import diagnosis, values_of, wait_until
+from live import LowPass, to_stamp, values_of, wait_until
 import numpy as np
 from ou_monitor.online.filter.filter_state import delay, phase_lag
 import pytest
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Float32, Float64
+from std_msgs.msg import Float32
 
-NODE = '/ou_adaptive_filter'
-NAME = 'ou_adaptive_filter: adaptive low-pass'
 LINE = 250.0
 
 
-class Rig:
+class Rig(LowPass):
     """The filter with four notches, a gyro with a line, and eRPM in a field of an odd type."""
 
     def __init__(self, world):
-        self.probe = world.probe()
-        self.output = self.probe.listen(f'{NODE}/output', Imu)
-        self.cutoff = self.probe.listen(f'{NODE}/cutoff', Float64)
-        self.lag = self.probe.listen(f'{NODE}/lag', Float64)
-        self.diagnostics = self.probe.listen('/diagnostics', DiagnosticArray)
-        self.input = self.probe.publisher('/input', Imu, 1000)
-        self.rpm = self.probe.publisher('/rpm', JointState)
-        self.throttle = self.probe.publisher('/throttle', Float32)
-        self.process = world.start(
-            'adaptive_filter', '--ros-args', '-p', 'notch.count:=4', '-p',
+        super().__init__(
+            world, {'rpm': JointState, 'throttle': Float32}, '-p', 'notch.count:=4', '-p',
             'notch.rpm_unit:=erpm', '-p', 'notch.poles:=14', '-p',
             'rpm.type:=sensor_msgs/msg/JointState', '-p', 'rpm.field:=velocity[]')
-        wait_until(lambda: self.input.get_subscription_count()
-                   and self.rpm.get_subscription_count()
-                   and self.throttle.get_subscription_count(), what='subscriptions')
-        wait_until(lambda: self.probe.node.count_publishers(f'{NODE}/output'))
-        time.sleep(0.3)
         self.rng = np.random.default_rng(1)
         self.sent = 0
 
@@ -44,22 +28,20 @@ class Rig:
         for _ in range(samples):
             t = 100.0 + 1e-3 * self.sent
             if self.sent % 20 == 0:
-                self.throttle.publish(Float32(data=0.5))
+                self.inputs['throttle'].publish(Float32(data=0.5))
                 if rpm:
-                    self.rpm.publish(JointState(velocity=[60.0 * 7.0 * LINE] * 2))
+                    self.inputs['rpm'].publish(JointState(velocity=[60.0 * 7.0 * LINE] * 2))
                 time.sleep(0.008)
             message = Imu()
-            message.header.stamp.sec = int(t)
-            message.header.stamp.nanosec = round(t % 1.0 * 1e9) % 10**9
+            message.header.stamp = to_stamp(t)
             gyro = message.angular_velocity
             gyro.x = 5.0 * np.sin(2 * np.pi * LINE * t) + 0.1 * self.rng.standard_normal()
-            self.input.publish(message)
+            self.inputs['input'].publish(message)
             self.sent += 1
 
     @property
     def said(self):
-        status = diagnosis(self.diagnostics, NAME)
-        return {} if status is None else values_of(status)
+        return {} if self.status is None else values_of(self.status)
 
 
 @pytest.fixture(scope='module')
@@ -84,9 +66,9 @@ def test_rpm_of_any_field_sets_the_notches(rig):
 
 
 def test_a_bad_unit_is_refused_and_none_is_accepted(rig):
-    refused = rig.probe.set_parameter(NODE, 'notch.poles', 0)
+    refused = rig.set('notch.poles', 0)
     assert not refused.successful and 'notch.poles' in refused.reason
-    assert rig.probe.set_parameter(NODE, 'notch.count', 0).successful
+    assert rig.set('notch.count', 0).successful
 
     def faded():
         rig.fly(200)

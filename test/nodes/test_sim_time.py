@@ -3,9 +3,8 @@
 import math
 import time
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from live import ou_path, values_of, wait_until
+from live import ou_path, to_stamp, values_of, wait_until
 from made_bags import encode
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.standard_types import FLOAT32
@@ -66,7 +65,7 @@ def test_without_a_clock_it_says_so(world):
 
     def heard():
         now = time.monotonic() - begin
-        ticks.publish(Clock(clock=Time(sec=int(now), nanosec=int(now % 1.0 * 1e9))))
+        ticks.publish(Clock(clock=to_stamp(now)))
         said()
         return float(values_of(states[-1].status[0])['t']) > 0.0
     wait_until(heard, what='samples on simulated time')

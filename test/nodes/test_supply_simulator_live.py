@@ -2,9 +2,8 @@
 
 import math
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from live import diagnosis, refusal, values_of, wait_until
+from live import diagnosis, refusal, seconds, to_stamp, values_of, wait_until
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
@@ -47,8 +46,7 @@ def test_simulated_time_repeats_the_path_after_a_reset(world):
     def tick(steps):
         nonlocal clock
         clock += steps
-        now = 1_000_000_000_000 + 50_000_000 * clock
-        ticks.publish(Clock(clock=Time(sec=now // 10**9, nanosec=now % 10**9)))
+        ticks.publish(Clock(clock=to_stamp(1000.0 + 0.05 * clock)))
 
     def path(first, last):
         # A clock that did not reach the node goes on.
@@ -67,7 +65,7 @@ def test_simulated_time_repeats_the_path_after_a_reset(world):
     # A clock that is set: the supply goes on from where it was.
     tick(2000)
     np.testing.assert_allclose(path(begin, begin + 500), expected, rtol=0.0, atol=1e-6)
-    stamps = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in got[begin:]])
+    stamps = np.array([seconds(m.header.stamp) for m in got[begin:]])
     steps = np.sort(np.diff(stamps))
     np.testing.assert_allclose(steps[:-1], 0.005, rtol=0.0, atol=1e-6)
     assert 95.0 < steps[-1] < 101.0

@@ -354,11 +354,9 @@ class Estimator:
 
     def send(self, voltage: float, stamp: float, output: Any = None,
              current: float = math.nan) -> None:
-        from builtin_interfaces.msg import Time
         from sensor_msgs.msg import BatteryState
-        whole, rest = divmod(round(stamp * 1e9), 10**9)
         message = BatteryState(voltage=voltage, current=current)
-        message.header.stamp = Time(sec=whole, nanosec=rest)
+        message.header.stamp = to_stamp(stamp)
         (output or self.output).publish(message)
 
     def feed(self, voltages: list[float], dt: float = 0.001,
@@ -382,6 +380,37 @@ class Estimator:
         return int(self.field(name))
 
 
+class LowPass:
+    """An adaptive filter of an IMU, with its outputs, and publishers on its `inputs`."""
+
+    node = '/ou_adaptive_filter'
+
+    def __init__(self, world: World, inputs: dict[str, Any], *arguments: str) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from sensor_msgs.msg import Imu
+        from std_msgs.msg import Float64
+        self.probe = world.probe()
+        self.output = self.probe.listen(f'{self.node}/output', Imu)
+        self.cutoff, self.lag = (self.probe.listen(f'{self.node}/{name}', Float64)
+                                 for name in ('cutoff', 'lag'))
+        self._diagnostics = self.probe.listen('/diagnostics', DiagnosticArray)
+        self.inputs = {topic: self.probe.publisher(f'/{topic}', kind, 1000)
+                       for topic, kind in {'input': Imu, **inputs}.items()}
+        self.process = world.start('adaptive_filter', '--ros-args', *arguments)
+        wait_until(lambda: all(one.get_subscription_count() for one in self.inputs.values()),
+                   what='subscriptions')
+        # Both ends must know of each other before the first message.
+        wait_until(lambda: self.probe.node.count_publishers(f'{self.node}/output'))
+        time.sleep(0.3)
+
+    @property
+    def status(self) -> Any:
+        return diagnosis(self._diagnostics, 'ou_adaptive_filter: adaptive low-pass')
+
+    def set(self, name: str, value: Any) -> Any:
+        return self.probe.set_parameter(self.node, name, value)
+
+
 def refusal(make: Callable[[], Any], *arguments: object) -> str:
     """Return the error of `make` in this process with ROS arguments, which must fail."""
     from ou_monitor.errors import InputError
@@ -401,6 +430,13 @@ def refusal(make: Callable[[], Any], *arguments: object) -> str:
 def values_of(status: Any) -> dict[str, str]:
     """Return the key/value pairs of a DiagnosticStatus."""
     return {pair.key: pair.value for pair in status.values}
+
+
+def to_stamp(t: float) -> Any:
+    """Return a builtin_interfaces/Time of a time, s."""
+    from builtin_interfaces.msg import Time
+    whole, rest = divmod(round(t * 1e9), 10**9)
+    return Time(sec=whole, nanosec=rest)
 
 
 def seconds(stamp: Any) -> float:
