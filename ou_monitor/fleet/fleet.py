@@ -108,7 +108,11 @@ class Fleet:
 
     def recordings_of(self, vehicle: str) -> list[Row]:
         """Return one row for each recording of a vehicle."""
-        return list({row['path']: row for row in self.rows if row['vehicle'] == vehicle}.values())
+        return [row for row in self._each if row['vehicle'] == vehicle]
+
+    @property
+    def _each(self) -> list[Row]:
+        return list({row['path']: row for row in self.rows}.values())
 
     @property
     def failed(self) -> list[Row]:
@@ -121,10 +125,9 @@ class Fleet:
         return [row for row in self.rows if row['duplicate_of'] is not None]
 
     @property
-    def analysed(self) -> int:
-        """Return the number of recordings that have results of their own."""
-        return len({row['path'] for row in self.rows
-                    if row['error'] is None and row['duplicate_of'] is None})
+    def analysed(self) -> list[Row]:
+        """Return one row for each recording that has results of its own."""
+        return [row for row in self._each if row['error'] is None and row['duplicate_of'] is None]
 
 
 def run_fleet(found: SearchResult, folder: Path, options: Options, version: Callable[[], str], *,

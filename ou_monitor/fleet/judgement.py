@@ -322,23 +322,23 @@ def weighted_line(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[floa
     """Return slope and start of a weighted line, and the standard error of the slope."""
     # The weights are 1 / (error^2 + s^2), with the scatter s that explains the residuals (0 if the
     # errors do); the residuals give the scale of the error, with n - 2 degrees of freedom.
-    columns = np.column_stack((np.ones(x.size), x))
     variance = error ** 2
 
-    def fit(scatter: float) -> tuple[FloatArray, FloatArray, float]:
-        root = 1.0 / np.sqrt(np.maximum(variance + scatter, 1e-24))
-        found = np.linalg.lstsq(root[:, None] * columns, root * y, rcond=None)[0]
-        rest = root * (y - columns @ found)
-        return found, root, float(rest @ rest) / (x.size - 2)
+    def fit(scatter: float) -> tuple[float, float, float, float]:
+        weight = 1.0 / np.maximum(variance + scatter, 1e-24)
+        middle, level = (float(np.average(values, weights=weight)) for values in (x, y))
+        spread = float(weight @ (x - middle) ** 2)
+        slope = float(weight @ ((x - middle) * (y - level))) / spread
+        start = level - slope * middle
+        return slope, start, float(weight @ (y - start - slope * x) ** 2) / (x.size - 2), spread
 
     low, high = 0.0, max(float(np.ptp(y)) ** 2, 1e-24)
     # The scale falls as the scatter grows; 60 halvings exhaust a double's precision.
     for _ in range(60 if fit(0.0)[2] > 1.0 else 0):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fit(middle)[2] > 1.0 else (low, middle)
-    found, root, scale = fit(low)
-    inverse = np.linalg.inv((root[:, None] * columns).T @ (root[:, None] * columns))
-    return float(found[1]), float(found[0]), math.sqrt(scale * float(inverse[1, 1]))
+    slope, start, scale, spread = fit(low)
+    return slope, start, math.sqrt(scale / spread)
 
 
 # The median of |z| of a normal distribution.

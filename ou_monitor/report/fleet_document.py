@@ -143,7 +143,7 @@ def _growth(judged: Judgement, trend: Trend) -> str:
 
 
 def _analysed(fleet: Fleet) -> str:
-    parts = [f'{fleet.analysed} of {counted(fleet.recordings, "recording")} of '
+    parts = [f'{len(fleet.analysed)} of {counted(fleet.recordings, "recording")} of '
              f'{counted(len(fleet.vehicles), "vehicle")} analysed']
     if fleet.failed:
         parts.append(f'{len(fleet.failed)} could not be')
@@ -445,8 +445,8 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
             for name, k in judged.odd_recordings()]
     return {
         'headline': ' '.join(answer(fleet)), 'recordings': fleet.recordings,
-        'analysed': fleet.analysed,
-        'failed': len(fleet.failed), 'duplicates': len(fleet.duplicates),
+        'analysed': len(fleet.analysed), 'failed': len(fleet.failed),
+        'duplicates': len(fleet.duplicates),
         'brownout_voltage': fleet.limit,
         'vehicles': [{
             'vehicle': vehicle,
@@ -472,12 +472,6 @@ def _vehicle_value(judged: Judgement, name: str, vehicle: str) -> float:
             if vehicle in one.names else NAN)
 
 
-def one_each(fleet: Fleet) -> list[Row]:
-    """Return one row for each analysed recording with a known lowest voltage."""
-    rows = {row['path']: row for row in fleet.rows if row['lowest'] is not None}
-    return list(rows.values())
-
-
 def dips_of(rows: Sequence[Row]) -> tuple[int, float, int] | None:
     """Return number of dips, seconds below the limit, recordings with dips; None if unknown."""
     known = [row for row in rows if row['dips'] is not None]
@@ -488,7 +482,7 @@ def dips_of(rows: Sequence[Row]) -> tuple[int, float, int] | None:
 
 def worst(fleet: Fleet) -> list[Row]:
     """Return the recordings by number of dips, most first, then by lowest voltage per cell."""
-    return sorted(one_each(fleet),
+    return sorted((row for row in fleet.analysed if row['lowest'] is not None),
                   key=lambda row: (-(row['dips'] or 0), _of_a_cell(row), row['path']))
 
 
@@ -499,7 +493,7 @@ def _of_a_cell(row: Row) -> float:
 
 def sentences(fleet: Fleet) -> list[str]:
     """Return the main facts for a pilot; empty if no recording has a voltage."""
-    rows = one_each(fleet)
+    rows = worst(fleet)
     if not rows:
         return []
     lowest, found = _lowest_of(rows), dips_of(rows)
@@ -508,7 +502,7 @@ def sentences(fleet: Fleet) -> list[str]:
     elif not found[0]:
         text = f'No recording fell below {fleet.limit:g} V: the lowest was {lowest}'
     else:
-        most, (count, below, recordings) = worst(fleet)[0], found
+        most, (count, below, recordings) = rows[0], found
         where = f'in {recordings} of {counted(len(rows), "recording")}'
         if recordings > 1 and most['dips'] > 1:
             where += f', most in {_name(most)}, {most["dips"]}'
@@ -669,7 +663,7 @@ def _over_throttle(fleet: Fleet) -> list[Part]:
 
 def _causes(fleet: Fleet) -> list[Part]:
     """Return the counts of the verdicts and causes of discover."""
-    found = {row['path']: row for row in fleet.rows if row['verdict'] is not None}.values()
+    found = [row for row in fleet.analysed if row['verdict'] is not None]
     counts = Counter([f"verdict {row['verdict']}" for row in found] + [
         f'cause {cause}' for row in found for cause in dict.fromkeys(row['causes'] or ())])
     return [Table(['what', 'recordings'], [[text, str(n)] for text, n in counts.most_common()],
@@ -681,28 +675,24 @@ def _recordings(fleet: Fleet) -> list[Part]:
     places: dict[str, dict[str, int]] = {
         name: {path: k for k, path in enumerate(values.paths)}
         for name, values in judged.values.items()}
-    firsts: dict[str, Row] = {}
     flags: dict[str, set[str]] = {}
     for row in fleet.rows:
-        if row['error'] is not None or row['duplicate_of'] is not None:
-            continue
-        firsts.setdefault(row['path'], row)
         flags.setdefault(row['path'], set()).update(row['flags'] or ())
     rows, names = [], short_names(fleet.vehicles)
-    for path, first in list(firsts.items())[:_RECORDINGS]:
-        measured = [_measured(values, judged.recordings[name].score, places[name].get(path))
-                    for name, values in judged.values.items()]
-        start = f"{first['start']:%Y-%m-%d %H:%M UTC}" if first['start'] else ''
+    for row in fleet.analysed[:_RECORDINGS]:
+        measured = [
+            _measured(values, judged.recordings[name].score, places[name].get(row['path']))
+            for name, values in judged.values.items()]
+        start = f"{row['start']:%Y-%m-%d %H:%M UTC}" if row['start'] else ''
         rows.append([
-            names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
-            f"{first['recording']}\n{start}", _cells(first), _cell(first['duration_s'] or None),
-            _cell(first['lowest'], 4),
-            UNKNOWN if first['dips'] is None else f"{first['dips']:g}", *measured,
-            ', '.join(sorted(flags[path])) or UNKNOWN])
+            names.get(row['vehicle'], UNKNOWN), str(row['flight'] or UNKNOWN),
+            f"{row['recording']}\n{start}", _cells(row), _cell(row['duration_s'] or None),
+            _cell(row['lowest'], 4), UNKNOWN if row['dips'] is None else f"{row['dips']:g}",
+            *measured, ', '.join(sorted(flags[row['path']])) or UNKNOWN])
     heads = ['vehicle', 'flight', 'recording', 'cells', 's', 'lowest, V', 'dips', *[
         f'{name}, {_UNITS[name]}' + '\nper cell' * (name in OF_PACK) for name in QUANTITIES],
         'flags']
-    more = len(firsts) - _RECORDINGS
+    more = len(fleet.analysed) - _RECORDINGS
     return [Table.of_known(heads, rows, left=[0, 2, len(heads) - 1]), Text(
         'As measured; "?": guessed; pack: of the whole supply. Small print: the '
         'throttle and, if the vehicle has enough flights, the distance from its other flights in '

@@ -51,7 +51,7 @@ def test_each_failure_is_one_row(odd, tmp_path, one_process):
     assert {row['recording'] for row in fleet.failed} == {
         'fifo.mcap', 'fifo.csv', 'loop.mcap', 'gone.mcap', 'gone.csv', 'zero', 'bag', 'cut',
         'name\\x1b[2J.mcap'}
-    assert fleet.analysed == 1
+    assert len(fleet.analysed) == 1
     for row in fleet.failed:
         assert row['error'].isprintable() and len(row['error']) < 500
     errors = {row['recording']: row['error'] for row in fleet.failed}
