@@ -243,14 +243,14 @@ def _knots(u: FloatArray) -> list[float]:
     """Return increasing knots at even quantiles of throttle, not too close to each other."""
     pieces = min(max(u.size // _ROWS, 1), _PIECES)
     wanted = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1)).tolist()
-    knots = wanted[:1]
+    knots: list[float] = wanted[:1]
     for knot in wanted[1:]:
         if knot - knots[-1] >= _APART:
             knots.append(knot)
     # The last knot is the highest throttle, so that the curve does not flatten before it.
     if len(knots) > 1:
         knots[-1] = wanted[-1]
-    return [float(knot) for knot in knots]
+    return knots
 
 
 # Minimum flights of a test for drift: two leave no scatter about their line.

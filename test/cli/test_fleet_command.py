@@ -1,6 +1,5 @@
 """`ou-monitor fleet` for users: complete, with bad files, killed, interrupted, resumed."""
 
-import csv
 import json
 import os
 from pathlib import Path
@@ -11,6 +10,7 @@ import subprocess
 import sys
 import time
 
+from command_line import failure, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.fleet.fleet import run_fleet
@@ -36,12 +36,9 @@ def flight(seed: int, sigma: float = 0.4, n: int = 6000) -> Recording:
                                  u0=5.0 - 0.5 * throttle), throttle, 'made')
 
 
-def write_csv(made: Recording, path: Path) -> None:
+def write(path: Path, made: Recording) -> Path:
     """Write a recording as a CSV."""
-    with path.open('w', newline='', encoding='utf-8') as file:
-        rows = csv.writer(file)
-        rows.writerow(['time_s', 'voltage_v', 'throttle'])
-        rows.writerows(zip(made.t.tolist(), made.voltage.tolist(), made.throttle.tolist()))
+    return write_csv(path, made.t, made.voltage, made.throttle)
 
 
 @pytest.fixture(scope='module')
@@ -51,7 +48,7 @@ def logs(tmp_path_factory) -> Path:
     for k, vehicle in enumerate(('uav1', 'uav2')):
         (folder / vehicle).mkdir()
         for number in range(1, FLIGHTS + 1):
-            write_csv(flight(100 * k + number), folder / vehicle / f'flight_{number}.csv')
+            write(folder / vehicle / f'flight_{number}.csv', flight(100 * k + number))
     write_recording(flight(7), folder / 'uav2' / 'bag_9', type='float32',
                     start_ns=1_700_000_000_000_000_000)
     (folder / 'uav1' / 'bad.mcap').write_text('this is no bag')
@@ -299,11 +296,7 @@ def test_killed_and_resumed_gives_the_same(logs, rows, tmp_path, one_process):
 
 
 def refused(capsys, *arguments: object) -> str:
-    """Return the one line with which the command refuses."""
-    assert main(['fleet', *map(str, arguments)]) == 2
-    said = capsys.readouterr()
-    assert said.out == '' and len(said.err.splitlines()) == 1
-    return said.err
+    return failure(capsys, 'fleet', *arguments)
 
 
 @pytest.mark.parametrize('arguments, words', [
@@ -350,9 +343,8 @@ def test_files_in_a_folder_of_that_shape_are_not_its_own(name, logs, tmp_path, c
 def test_an_output_is_replaced_only_if_its_content_is_of_fleet(name, tmp_path, one_process,
                                                                capsys, monkeypatch):
     """Before the work and before the write; --force replaces any."""
-    write_csv(flight(1, n=3000), tmp_path / 'a.csv')
     out = tmp_path / 'out'
-    again = ['fleet', str(tmp_path / 'a.csv'), '--output', str(out)]
+    again = ['fleet', str(write(tmp_path / 'a.csv', flight(1, n=3000))), '--output', str(out)]
     assert main(again) == 0 and main(again) == 0
     made = {path.name: path.read_bytes() for path in out.glob('fleet.*')}
     table = pyarrow.table({'vehicle': ['mine'], 'vehicle_from': ['mine']})
@@ -393,7 +385,7 @@ def test_millisecond_stamps_are_refused_and_odd_names_shown(tmp_path, one_proces
     logs.mkdir()
     np.savetxt(logs / 'ms.csv', np.column_stack([1.7e12 + 1e3 * made.t, made.voltage]), '%.16g',
                ',', header='time_s,voltage_v', comments='')
-    write_csv(made, logs / os.fsdecode(b'\xff.csv'))
+    write(logs / os.fsdecode(b'\xff.csv'), made)
     assert main(['fleet', str(logs), '--output', str(tmp_path / 'out')]) == 0
     rows = parquet.read_table(tmp_path / 'out' / 'fleet.parquet').to_pylist()
     assert {row['recording']: row['start'] for row in rows} == {
@@ -409,8 +401,7 @@ def test_two_packs_in_one_folder_are_said(tmp_path, one_process, capsys):
         logs = tmp_path / name
         logs.mkdir()
         for k, factor in enumerate(factors):
-            write_csv(Recording(made.t, factor * made.voltage, made.throttle, ''),
-                      logs / f'{k}.csv')
+            write_csv(logs / f'{k}.csv', made.t, factor * made.voltage, made.throttle)
     assert main(['fleet', str(tmp_path), '--output', str(tmp_path / 'out'), '--json',
                  str(tmp_path / 'x.json')]) == 0
     said = [note for note in json.loads((tmp_path / 'x.json').read_text())['notes']

@@ -41,19 +41,6 @@ def test_write_json_to_a_file_and_to_standard_output(tmp_path, capsys):
     assert json.loads(target.read_text(encoding='ascii')) == {'unit': 'V/√s', 'x': None}
 
 
-def test_unwritable_outputs_are_named(tmp_path):
-    """A missing folder, a folder, and a file used as a folder; the last only when written."""
-    (tmp_path / 'file').write_text('')
-    for target in (tmp_path / 'no' / 'x.json', tmp_path):
-        with pytest.raises(InputError, match='cannot write'):
-            output.check_writable(str(target))
-        with pytest.raises(InputError, match='cannot write'):
-            output.write_text('x', target)
-    output.check_writable(None)
-    output.check_writable('-')
-    output.check_writable(str(tmp_path / 'new.json'))
-
-
 def test_table_is_aligned():
     """Numbers flush right, words flush left, no trailing blanks."""
     text = terminal.table(['n', 'word'], [['1', 'a'], ['1000', 'long one']], left=[1])
@@ -111,16 +98,6 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(InputError, match='No space left'):
         output.write_text('new page', target, force=True)
     assert target.read_text() == 'old' and list(tmp_path.iterdir()) == [target]
-
-
-def test_files_are_overwritten_only_with_force(tmp_path):
-    """A file of any output; what is no file, such as a device, is no loss."""
-    there = tmp_path / 'report.html'
-    there.write_text('old')
-    with pytest.raises(InputError, match="--report .*report.html' exists already: --force"):
-        output.check_paths({}, {'--report': there})
-    output.check_paths({}, {'--report': there}, force=True)
-    output.check_paths({}, {'--json': '-', '--report': '/dev/null', '--save-model': None})
 
 
 def bag_folder(path: Path, content: str) -> Path:
