@@ -24,7 +24,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.recordings.importers.csv_table import holds_supply, read_throttle_alone
-from ou_monitor.recordings.importers.formats import is_csv
+from ou_monitor.recordings.importers.formats import CSV, kind_of
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.model_file import ModelFile, read_model
 from ou_monitor.recordings.read import read_recording
@@ -164,7 +164,7 @@ def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
     if text in PROFILES or not path.exists():
         return False
     # A table without voltage is a profile: times from 0 s, linear between.
-    table = path.suffix.lower() == '.csv' or is_csv(path)
+    table = path.suffix.lower() == '.csv' or kind_of(path) == CSV
     return not table or holds_supply(path, columns)
 
 

@@ -16,7 +16,7 @@ from ou_monitor.analysis.quality import faults
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.vehicles import start_of
 from ou_monitor.online.risk.first_passage import brownout_probability
-from ou_monitor.recordings.importers.formats import is_csv
+from ou_monitor.recordings.importers.formats import CSV, kind_of
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Defect, defect_of, NAN, Recording
@@ -65,7 +65,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
     recording = read_recording(
         path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
         throttle_topic=options.throttle_topic, columns=options.columns,
-        partial=options.partial or is_csv(Path(path)))
+        partial=options.partial or kind_of(Path(path)) == CSV)
     check_size(recording)
     if found := faults(recording):
         # Not compared with the others.

@@ -18,7 +18,7 @@ import stat
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import FILE, is_part
 from ou_monitor.recordings.importers.csv_table import holds_supply
-from ou_monitor.recordings.importers.formats import is_log
+from ou_monitor.recordings.importers.formats import BAG, CSV, kind_of
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 
@@ -115,7 +115,7 @@ def _kind(path: Path) -> tuple[str, str] | None:
         return None
     if kind == '.csv':
         return None if _has_columns(path) else _CSV
-    if kind in _LOGS and is_log(path):
+    if kind in _LOGS and kind_of(path) not in (BAG, CSV):
         return None
     return _LOG if kind in _LOGS and kind not in _COMMON else ('', '')
 

@@ -19,7 +19,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, NONE, signal_of)
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
-from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
+from ou_monitor.recordings.importers.formats import BAG, CSV, import_log, kind_of
 from ou_monitor.recordings.importers.log import (
     CsvColumns, Log, RawColumns, Request, Series, SIGNAL, unusable_words)
 from ou_monitor.records import clock_unit, MOST_STAMP, Recording
@@ -95,7 +95,8 @@ def _read(
 ) -> tuple[Recording, Log | None]:
     """Read a recording, repeats included; of a log, return also the `Log`, with `signal`."""
     _check_part(start, end)
-    csv, log = is_csv(path), is_log(path)
+    kind = kind_of(path)
+    csv, log = kind == CSV, kind not in (CSV, BAG)
     for option, value in of_bags.items():
         if (csv or log) and value is not None:
             raise InputError(f"{path} is a {'CSV' if csv else 'log'}: "
@@ -198,7 +199,7 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
-    if is_csv(path):
+    if kind_of(path) == CSV:
         return Series(signal, SIGNAL, *read_column(path, signal, columns), '1')
     from ou_monitor.recordings.bag_samples import read_bag_signal
 

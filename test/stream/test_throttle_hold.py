@@ -27,7 +27,7 @@ def hold_of(pushed, newest=2.0, own=True, voltage_own=True):
 
 
 @given(
-    st.lists(st.tuples(STAMPS, st.floats(0.0, 1.0)), max_size=30),
+    st.lists(st.tuples(STAMPS, st.floats(0.0, 1.0) | st.just(math.nan)), max_size=30),
     st.lists(STAMPS, min_size=1, max_size=60))
 def test_agrees_with_its_definition(pushed, asked):
     hold = hold_of(pushed)
@@ -52,11 +52,6 @@ def test_unneeded_throttles_are_dropped():
     assert hold.held()[0].size == 11
     np.testing.assert_array_equal(hold.at(np.array([0.9885, 0.9895, 0.99, 2000.0])),
                                   [np.nan, 0.989, 0.99, 0.999])
-
-
-def test_unknown_throttle_is_held_too():
-    hold = hold_of([(1.0, 0.5), (2.0, math.nan)])
-    np.testing.assert_array_equal(hold.at(np.array([0.5, 1.5, 2.5])), [np.nan, 0.5, np.nan])
 
 
 def test_an_empty_hold_gives_unknown_throttle():

@@ -141,27 +141,15 @@ _TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log', '.lvm', '.msl
            '.xls')
 
 
-def _begins_as(path: Path) -> Format | None:
-    """Return the format of a file by its first bytes; None if unknown or unreadable."""
+def kind_of(path: Path) -> str:
+    """Return the name of the format as which a recording is read: CSV, that of a log, or BAG."""
+    found, ending = None, path.suffix.lower()
     # The reader reports why it cannot be read.
     with suppress(InputError):
-        return detect(path) if path.is_file() else None
-    return None
-
-
-def is_csv(path: Path) -> bool:
-    """Return whether a file is a CSV by its ending, and not another format by its first bytes."""
-    ending = path.suffix.lower()
-    if ending not in _TABLES or path.is_dir():
-        return False
-    found = _begins_as(path)
-    return found.name == CSV if found else ending == '.csv'
-
-
-def is_log(path: Path) -> bool:
-    """Return whether a file is a log of an autopilot, by its first bytes."""
-    found = _begins_as(path)
-    return found is not None and found.name not in (BAG, CSV)
+        found = detect(path) if path.is_file() else None
+    if found is None:
+        return CSV if ending == '.csv' and not path.is_dir() else BAG
+    return found.name if found.name != CSV or ending in _TABLES else BAG
 
 
 def import_log(path: Path, request: Request) -> Log:
