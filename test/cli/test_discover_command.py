@@ -1,6 +1,5 @@
 """`ou-monitor discover`: CSV in; summary, JSON, model, page out; one line for bad input."""
 
-from dataclasses import replace
 import json
 import re
 from xml.etree import ElementTree
@@ -8,16 +7,9 @@ from xml.etree import ElementTree
 from command_line import answer, failure, strict, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
-from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.words import both_names, explain, plain, PLAIN_NAMES, verdict_words
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.slow import Drift
-from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
@@ -102,35 +94,6 @@ def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
     assert strict(out)['verdict'] == 'insufficient_data' and err.count('\n') == 1
 
 
-def made(*causes):
-    """Return a finding of causes: term, gain, its error, p."""
-    terms = tuple(term for term, *_ in causes)
-    samples = Samples(np.arange(400) / 100.0, 5.0 + 0.01 * np.sin(np.arange(400.0) ** 2), None)
-    model = SupplyModel((OU(60.0, 0.3, 5.0), *terms))
-    return Finding(
-        'x', 400, 4.0, Verdict.EXPLAINED, ('s',), baseline=OU(60.0, 0.3, 5.0), baseline_score=2.0,
-        causes=tuple(Cause(term, {}, gain, se, p, (), explain(
-            term, {}, gain, se, (), False, '', len(causes)), False)
-            for term, gain, se, p in causes),
-        model=model, se=({},) * len(model.terms), samples=samples,
-        simulated=SupplyModel((OU(60.0, 0.3, 5.0),)))
-
-
-def test_the_answer_begins_with_the_largest_gains():
-    """Three names, the number of the others; then the reason why the model is not to be used."""
-    nan = float('nan')
-    finding = made(
-        (LoadSag(0.6, 0.0), 0.2, 0.01, 0.0), (Drift(0.1, 0.0), nan, nan, nan),
-        *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)])
-    assert re.findall(r'\((\w+)\)', verdict_words(finding)[0]) == ['tone', 'load_sag', 'drift']
-    more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
-        *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
-    strongest, *_, refused = verdict_words(more)
-    assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'measurement_noise']
-    assert '1 more' in strongest and refused.startswith('It strays')
-    assert more.closer and not replace(more, larger=True).closer
-
-
 @pytest.mark.parametrize('words, part', [
     (['--seed', '-1'], '--seed'), (['--report', '-'], '--report'),
     (['--save-model', '-'], '--save-model'), (['--json', '/no/such/folder/x.json'], 'folder'),
@@ -144,19 +107,6 @@ def test_bad_recordings_are_one_line(tmp_path, capsys):
     path = tmp_path / 'odd.csv'
     path.write_text('a,b\n1,2\n')
     failure(capsys, 'discover', path)
-
-
-def test_every_cause_has_a_plain_name():
-    assert set(PLAIN_NAMES) == set(catalogue()) - {'ou'}
-    assert len(set(PLAIN_NAMES.values())) == len(PLAIN_NAMES)
-
-
-def test_plain_names_stand_before_the_names_in_code():
-    """Once each; names that are English words stay."""
-    assert plain('load_sag, drift and tone explain it. Worse without load_sag.') == (
-        'Sag (load_sag), drift and tone explain it. Worse without sag.')
-    assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
-    assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'
 
 
 def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):

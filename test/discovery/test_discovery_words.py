@@ -2,14 +2,17 @@
 
 from dataclasses import replace
 import math
+import re
 
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.words import (
-    cause_rows, coupling_note, explain, gain_text, gain_words, overlap_words, parameters,
-    plain_words, verdict_words, with_error)
+    both_names, cause_rows, coupling_note, explain, gain_text, gain_words, overlap_words,
+    parameters, plain, PLAIN_NAMES, plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.tones import Tone
 import pytest
 
@@ -115,6 +118,34 @@ def test_each_verdict_has_its_sentence(verdict, named, left, words):
     text = ' '.join(verdict_words(found, doubts=['too slow'] if 'slow' in words else []))
     assert words in text and ('mnat' in text) == named
     assert ('A plain simulation lacks a line' in text) == named
+
+
+def test_the_answer_begins_with_the_largest_gains():
+    """Three names, the number of the others; then the reason why the model is not to be used."""
+    causes = [replace(SAG, term=term, gain=gain) for term, gain in (
+        (SAG.term, 0.2), (Drift(0.1, 0.0), NAN), (Tone(0.01, 11.0, 0.0, 0.0), 0.3),
+        (Tone(0.01, 23.0, 0.0, 0.0), 0.3))]
+    first, *_ = verdict_words(finding(Verdict.EXPLAINED, causes))
+    assert re.findall(r'\((\w+)\)', first) == ['tone', 'load_sag', 'drift']
+    more = finding(Verdict.PARTLY_EXPLAINED, refused='It strays', causes=[
+        *causes, replace(SAG, term=MeasurementNoise(0.01), gain=0.1)])
+    strongest, *_, refused = verdict_words(more)
+    assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'measurement_noise']
+    assert '1 more' in strongest and refused.startswith('It strays')
+    assert more.closer and not replace(more, larger=True).closer
+
+
+def test_every_cause_has_a_plain_name():
+    assert set(PLAIN_NAMES) == set(catalogue()) - {'ou'}
+    assert len(set(PLAIN_NAMES.values())) == len(PLAIN_NAMES)
+
+
+def test_plain_names_stand_before_the_names_in_code():
+    """Once each; names that are English words stay."""
+    assert plain('load_sag, drift and tone explain it. Worse without load_sag.') == (
+        'Sag (load_sag), drift and tone explain it. Worse without sag.')
+    assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
+    assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'
 
 
 @pytest.mark.parametrize('name', [name for name in catalogue() if name != 'ou'])
