@@ -293,7 +293,9 @@ class MonitorNode(Node):
 
     def _widen(self, parameters: list[RosParameter]) -> list[RosParameter]:
         """Read 2 as 2.0 where a parameter is a float: YAML writes such numbers without a point."""
-        return [_as_double(p) if p.name in self._floats else p for p in parameters]
+        return [RosParameter(p.name, RosParameter.Type.DOUBLE, float(p.value))
+                if p.name in self._floats and p.type_ is RosParameter.Type.INTEGER else p
+                for p in parameters]
 
     def _warn_misspelt(self) -> None:
         """Warn of overrides that rclpy would silently ignore."""
@@ -324,12 +326,6 @@ class MonitorNode(Node):
     def _after_set(self, parameters: list[RosParameter]) -> None:
         if self.running and any(p.name in self._changeable for p in parameters):
             self.apply(self.values())
-
-
-def _as_double(parameter: RosParameter) -> RosParameter:
-    if parameter.type_ is not RosParameter.Type.INTEGER:
-        return parameter
-    return RosParameter(parameter.name, RosParameter.Type.DOUBLE, float(parameter.value))
 
 
 def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:

@@ -9,8 +9,9 @@ file that names this node.  This module does not import ROS.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as NotReadyError
+from contextlib import contextmanager
 from dataclasses import replace
 import fcntl
 from itertools import takewhile
@@ -139,14 +140,9 @@ def _save(path: str, file: ModelFile, known: bytes) -> bytes:
         mode = stat.S_IMODE(os.fstat(handle).st_mode)
         if found.read(len(known) + 1) != known:
             raise ValueError('it has changed since it was read')
-    handle, beside = _write_beside(Path(path), text, mode)
-    os.close(handle)
-    try:
+    with _draft(Path(path), text, mode) as (handle, beside):
         os.rename(beside, path)
-    except BaseException:
-        os.unlink(beside)
-        raise
-    _sync_folder(Path(path))
+        os.close(handle)
     return text
 
 
@@ -158,8 +154,9 @@ def _check_kind(path: str | Path) -> None:
                          else 'it is not a regular file')
 
 
-def _write_beside(path: Path, text: bytes, mode: int) -> tuple[int, str]:
-    """Write a new file beside a path, synced and read back; return its open handle and name."""
+@contextmanager
+def _draft(path: Path, text: bytes, mode: int) -> Iterator[tuple[int, str]]:
+    """Give handle and name of a new file beside a path, synced and read back, to be renamed."""
     # Made by O_CREAT | O_EXCL under a random name, so no other file is opened or removed.
     handle, beside = tempfile.mkstemp(prefix=f'.{path.name}.', dir=path.parent)
     try:
@@ -168,15 +165,12 @@ def _write_beside(path: Path, text: bytes, mode: int) -> tuple[int, str]:
         os.fsync(handle)
         if os.pread(handle, len(text) + 1, 0) != text:
             raise ValueError('the bytes read back differ from those written')
+        yield handle, beside
     except BaseException:
         os.close(handle)
         os.unlink(beside)
         raise
-    return handle, beside
-
-
-def _sync_folder(path: Path) -> None:
-    """Flush a rename to the disk."""
+    # Flush the rename to the disk.
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -317,19 +311,13 @@ class LatchFile:
         """Write a new file, sync, read back and lock it, and rename it over the old one."""
         exists = self._claim() is not None
         # Readable by all, like an ordinary file.
-        handle, beside = _write_beside(self.path, text, 0o644)
-        try:
+        with _draft(self.path, text, 0o644) as (handle, beside):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not exists:
                 # Fails if a file has appeared meanwhile (so would a link, which FAT lacks).
                 os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
             os.rename(beside, self.path)
-        except BaseException:
-            os.close(handle)
-            os.unlink(beside)
-            raise
-        self._keep_lock(handle)
-        _sync_folder(self.path)
+            self._keep_lock(handle)
         if not os.path.samestat(os.lstat(self.path), os.fstat(handle)):
             raise ValueError('another file has taken its place')
 
