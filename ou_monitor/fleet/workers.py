@@ -55,6 +55,9 @@ def usable_cores() -> int:
 class Workers(ABC):
     """Processes that call a function; a context manager."""
 
+    # Errors of a task whose worker died.
+    _deaths: tuple[type[Exception], ...]
+
     @abstractmethod
     def _room(self) -> int:
         """Return the maximum number of running tasks."""
@@ -66,10 +69,6 @@ class Workers(ABC):
     @abstractmethod
     def _wait(self, futures: Sequence[Any]) -> list[Any]:
         """Wait until a future is done; return all finished ones."""
-
-    @abstractmethod
-    def _outcome(self, future: Any) -> tuple[Any, str]:
-        """Return the result of a finished future, or its error."""
 
     @abstractmethod
     def close(self) -> None:
@@ -93,12 +92,19 @@ class Workers(ABC):
                 start(alone.popleft())
             for future in self._wait(list(running)):
                 k = running.pop(future)
-                result, why = self._outcome(future)
-                if why == LOST and k not in retried:
-                    retried.add(k)
-                    alone.append(k)
-                else:
-                    yield k, result, why
+                result, why = None, ''
+                try:
+                    result = future.result(timeout=_PATIENCE)
+                except self._deaths:
+                    if k not in retried:
+                        retried.add(k)
+                        alone.append(k)
+                        continue
+                    why = LOST
+                except Exception as error:
+                    # The function catches its own errors, so this is an error of the transport.
+                    why = ' '.join(f'The worker failed ({type(error).__name__}: {error}).'.split())
+                yield k, result, why
 
     def __enter__(self) -> Workers:
         return self
@@ -109,6 +115,8 @@ class Workers(ABC):
 
 class LocalWorkers(Workers):
     """Processes of this machine, each with a share of the memory."""
+
+    _deaths = (BrokenProcessPool,)
 
     def __init__(self, count: int) -> None:
         # Each worker waits at the reading end, and exits when this process closes the other end
@@ -139,25 +147,11 @@ class LocalWorkers(Workers):
     def _wait(self, futures: Sequence[Future[Any]]) -> list[Future[Any]]:
         return list(wait(futures, return_when=FIRST_COMPLETED).done)
 
-    def _outcome(self, future: Future[Any]) -> tuple[Any, str]:
-        try:
-            return future.result(), ''
-        except BrokenProcessPool:
-            return None, LOST
-        except Exception as error:
-            # The function catches its own errors, so this is an error of the transport.
-            return None, failure(error)
-
     def close(self) -> None:
         """End the workers at once."""
         self._alive.close()
         self._pool.shutdown(cancel_futures=True)
         self._watched.close()
-
-
-def failure(error: Exception) -> str:
-    """Return the message for an error in the transport to or from a worker."""
-    return ' '.join(f'The worker failed ({type(error).__name__}: {error}).'.split())
 
 
 @contextmanager
@@ -231,8 +225,9 @@ class ClusterWorkers(Workers):
             raise
 
     def _connect(self, address: str, check: Callable[[], str]) -> Any:
-        from distributed import Client
+        from distributed import Client, KilledWorker
 
+        self._deaths = (KilledWorker, TimeoutError)
         # Silence Dask's messages about workers: the table reports failures.
         for name in ('distributed', 'distributed.core', 'distributed.client',
                      'distributed.batched', 'tornado', 'asyncio'):
@@ -293,16 +288,6 @@ class ClusterWorkers(Workers):
                 return found
             # The scheduler is repeating the work of a worker that died.
             time.sleep(0.05)
-
-    def _outcome(self, future: Any) -> tuple[Any, str]:
-        from distributed import KilledWorker
-
-        try:
-            return future.result(timeout=_PATIENCE), ''
-        except (KilledWorker, TimeoutError):
-            return None, LOST
-        except Exception as error:
-            return None, failure(error)
 
     def close(self) -> None:
         """Release the workers."""
