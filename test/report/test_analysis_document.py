@@ -20,7 +20,7 @@ def analysis():
 
 def test_headline_warns_of_what_changes_its_own_numbers():
     """Millivolts, swapped leads; nothing where nothing is wrong."""
-    simulated = recording(1, TRUTH, seconds=4.0)
+    simulated = recording(1, TRUTH, seconds=2.0)
     assert not any('Beware' in one for one in answer(analyze(simulated)))
     sentence = answer(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))[0]
     assert sentence == ('Beware: the voltages seem to be millivolts or counts, not volts.')
