@@ -219,12 +219,20 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
     go = 1.0 - lengths[0], lengths[2] / (lengths[1] + lengths[2])
     transition = np.array([[1.0 - share, share, 0.0, 0.0], [1.0 - go[0], 0.0, go[0], 0.0],
                            [1.0 - go[1], 0.0, 0.0, go[1]], [1.0, 0.0, 0.0, 0.0]])
-    before, both = forward(np.stack((calm, hit, more))[which].transpose(2, 0, 1), transition,
-                           np.array([1.0, 0.0, 0.0, 0.0]))
+    density = np.stack((calm, hit, more))
+    before, _ = forward(density[which].transpose(2, 0, 1), transition,
+                        np.array([1.0, 0.0, 0.0, 0.0]))
     chance = np.stack([before @ (transition * (which == k)).sum(axis=1) for k in range(3)])
     scores = normal_scores(chance[0] * ndtr(view.z) + chance[1] * ndtr(view.z / wide)
                            + chance[2] * ndtr((view.z - mean) / again))
-    return scores, both - calm, 2 if keep == 0.0 else 6
+    # The filter leaves out the bad samples, which were chosen in hindsight.  So each choice pays
+    # its prior probability in full: a mixture would pay too little for a small error.
+    place = np.arange(e.size)
+    state = place - np.maximum.accumulate(np.where(bad, -1, place))
+    change = state[:-1], state[1:]
+    path = np.concatenate(([math.log1p(-share)], np.log(transition[change])))
+    gain = path + density[np.concatenate(([0], which[change])), place] - calm
+    return scores, gain, 2 if keep == 0.0 else 6
 
 
 def _repetition(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
