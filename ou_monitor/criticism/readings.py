@@ -38,6 +38,8 @@ _MOST, _EDGE = 1.5, 0.05
 # Maximum gap in a current, s; quantile of its size taken as full load; lags of the mean response
 # to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
+# Minimum autocorrelation of which a decay is taken.
+_CORRELATED = 0.1
 # Two levels of a voltage: minimum distance, in standard deviations about them and in ADC steps;
 # minimum switches, samples per switch, and share of the samples at each level.
 _APART, _STEPS, _SWITCHES, _DWELL, _SHARE = 5.0, 4.0, 3, 20, 0.05
@@ -139,16 +141,39 @@ def _on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: l
 def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
     """Return the gain in log-likelihood from a load, its square and its lags, nats."""
     lags = [lowpass(load, t, tau) for tau in _LAGS[_LAGS > float(np.median(np.diff(t)))].tolist()]
-    columns = np.diff(np.stack([load, load * load, *lags]))
-    change = np.diff(v)
-    spread = np.sqrt((columns * columns).sum(axis=1))
-    columns = columns[spread > 0.0] / spread[spread > 0.0, None]
-    if not columns.shape[0] or not change.any():
-        return 0.0
-    product = columns @ change
-    beta = np.linalg.lstsq(columns @ columns.T, product, rcond=1e-9)[0]
-    left = 1.0 - float(product @ beta) / float(change @ change)
-    return -0.5 * change.size * math.log(max(left, 1e-9))
+    columns = np.stack([load, load * load, *lags])
+    columns = columns - columns.mean(axis=1, keepdims=True)
+    spread = columns.std(axis=1)
+    trend = np.stack([np.ones(t.size), (t - t.mean()) / max(float(np.ptp(t)), 1e-300)])
+    both = np.concatenate((trend, columns[spread > 0.0] / spread[spread > 0.0, None]))
+    # The noise is an AR(1) whose coefficient is that of its slowest part, so that a wandering
+    # level does not pass for a response.
+    without, left = (_rest(v, x, 0.0) for x in (trend, both))
+    slow = _slowest(left)
+    alone = min(_squares(v, trend, phi) for phi in (slow, _slowest(without)))
+    beside = _squares(v, both, slow)
+    return 0.5 * v.size * math.log(max(alone, 1e-300) / max(beside, 1e-9 * alone, 1e-300))
+
+
+def _rest(v: FloatArray, columns: FloatArray, phi: float) -> FloatArray:
+    """Return what a regression leaves, after both sides are whitened by an AR(1)."""
+    x, y = columns[:, 1:] - phi * columns[:, :-1], v[1:] - phi * v[:-1]
+    beta = np.linalg.lstsq(x @ x.T, x @ y, rcond=1e-9)[0]
+    return np.asarray(y - beta @ x)
+
+
+def _squares(v: FloatArray, columns: FloatArray, phi: float) -> float:
+    return float(np.sum(_rest(v, columns, phi) ** 2))
+
+
+def _slowest(rest: FloatArray) -> float:
+    """Return the coefficient per sample of the slowest decay of an autocorrelation."""
+    found, m, whole = 0.0, 1, float(rest @ rest)
+    while 8 * m < rest.size and (now := float(rest[m:] @ rest[:-m])) > _CORRELATED * whole:
+        later = float(rest[2 * m:] @ rest[:-2 * m])
+        found = max(found, max(later / now, 0.0) ** (1.0 / m))
+        m *= 2
+    return min(found, 1.0)
 
 
 def find_bad(v: FloatArray, singles: int = _SINGLES) -> npt.NDArray[np.bool_]:

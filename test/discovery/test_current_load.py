@@ -12,6 +12,7 @@ from ou_monitor.model.load_fit import timing
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.report.discovery_document import discovery_document
 from ou_monitor.report.terminal import terminal
 import pytest
@@ -76,6 +77,19 @@ def test_throttle_stays_the_load_where_current_is_noise_or_unknown():
     for current in (None, noise, gap, np.full(N, 3.0), np.full(N, np.nan)):
         load, full = load_of(Recording(T, v, u, '', current=current), T, v, u, [])
         assert load is u and math.isnan(full)
+
+
+def test_one_step_of_the_current_on_a_rail_is_its_load():
+    """Differences of samples hid a step of six deviations; an unrelated step is no load."""
+    t = np.arange(20_000) / 1000.0
+    rng = np.random.default_rng(2)
+    noise = SupplyModel((OU(40.0, 0.125, 5.0), MeasurementNoise(0.004))).simulate(t, rng)
+    current = 0.6 + 1.5 * (t > 9.0) + 0.004 * rng.standard_normal(t.size)
+    nothing = np.full(t.size, np.nan)
+    for v, used in ((noise - 0.055 * current, True), (noise, False),
+                    (noise - 0.08 * (t > 13.0), False)):
+        _, full = load_of(Recording(t, v, nothing, '', current=current), t, v, None, [])
+        assert math.isfinite(full) == used
 
 
 @pytest.mark.parametrize('late', [2, 6])
