@@ -286,13 +286,36 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 
 def readings_of(recording: Recording) -> Recording:
-    """Return a recording without repeats of a reading; a note counts the repeats."""
+    """Return a recording without repeats of a reading and the sign of reverse; notes say so."""
+    recording = _unsigned(recording)
     places, t, period = new_readings(recording.t, recording.voltage)
     if period <= 1.0:
         return recording
     note = repeats_words(recording.t, t)
     return replace(part_of(recording, places, note), t=t,
                    held=recording.held + recording.n - t.size)
+
+
+def _unsigned(recording: Recording) -> Recording:
+    """Return a recording with the size of its throttle if that predicts the voltage better."""
+    u = recording.throttle
+    known = np.isfinite(u) & np.isfinite(recording.voltage)
+    if not np.count_nonzero(u < -_REVERSE) > _REVERSE * recording.n:
+        return recording
+    change = np.diff(recording.voltage[known])
+    signed, size = (_explained(change, np.diff(x[known])) for x in (u, np.abs(u)))
+    if not size > signed + math.log(recording.n):
+        return recording
+    return replace(recording, throttle=np.abs(u), notes=(*recording.notes, (
+        f'Throttle runs from {float(np.nanmin(u)):.3g} to {float(np.nanmax(u)):.3g}, and the '
+        'voltage falls in both directions: its absolute value is used.')))
+
+
+def _explained(y: FloatArray, x: FloatArray) -> float:
+    """Return the gain in log-likelihood if y is proportional to -x, nats."""
+    product, power = -float(x @ y), float(x @ x) * float(y @ y)
+    share = product * product / power if product > 0.0 and power > 0.0 else 0.0
+    return -0.5 * y.size * math.log1p(-min(share, 1.0 - 1e-9))
 
 
 def repeats_words(logged: FloatArray, read: FloatArray) -> str:
@@ -385,6 +408,8 @@ MOST_VOLTAGE = 1.0e6
 MOST_CURRENT = 1.0e6
 # Largest magnitude accepted as a throttle of 0..1, with a margin.
 MOST_THROTTLE = 2.0
+# Throttle below minus this, in more than this share of the samples, is reverse, not trim.
+_REVERSE = 0.05
 # Maximum share of implausible throttles that are errors of single samples, not another unit.
 WILD = 0.05
 # Maximum samples in a batch; NumPy's overhead per call is then negligible.

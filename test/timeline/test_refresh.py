@@ -350,3 +350,15 @@ def test_a_tenth_of_the_steps_has_another_size(same, found):
     steps = np.random.default_rng(1).permutation(steps) * np.resize((1.0, -1.0), 100)
     y = np.repeat(np.concatenate(([0.0], np.cumsum(steps))), 5)
     assert refresh_period(y) == found
+
+
+@pytest.mark.parametrize('depends, size', [(np.abs, True), (lambda u: 0.5 * (u + 1.0), False)])
+def test_reverse_counts_as_load_if_the_voltage_falls_with_it(depends, size):
+    """A robot's duty from -1 to 1 gave a sag of 3.7 V for 0.7; a stick's middle is half load."""
+    rng = np.random.default_rng(5)
+    u = rng.choice([-1.0, -0.5, 0.0, 0.3, 1.0], 100).repeat(20)
+    t = np.arange(u.size) / 20.0
+    v = 12.0 - 0.7 * depends(u) + 0.02 * rng.standard_normal(u.size)
+    found = readings_of(Recording(t, v, u))
+    np.testing.assert_array_equal(found.throttle, np.abs(u) if size else u)
+    assert any('absolute value' in note for note in found.notes) == size
