@@ -30,8 +30,10 @@ _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 _POINTS = 2000
 # Minimum probability of the other kind of level (constant or falling) to be reported.
 _UNSURE = 0.05
-# Time at the beginning over which a model from a file is aligned with the recording, s.
-_ALIGNED = 2.0
+# Minimum time at the beginning over which a model from a file is aligned with the recording, s; it
+# is doubled until the mean of a simulation varies less than this share of single samples, that is
+# until it holds some ten independent pieces.
+_ALIGNED, _STEADY = 2.0, 0.3
 
 
 def compare(recording: Recording, model: SupplyModel | None = None, *,
@@ -60,11 +62,16 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     lsb = samples.lsb
     yardstick = Yardstick(own, lsb, levels)
     rng = np.random.default_rng(seed)
-    # A model from a file has the level of another flight.
-    aligned = None if model is None else slice(0, max(10, int(np.searchsorted(
-        own.t, own.t[0] + _ALIGNED, side='right'))))
     shifts = np.zeros(seeds)
     stride = max(1, -(-own.t.size // _POINTS))
+    # A model from a file has the level of another flight.
+    aligned, before = None, 0.6
+    if model is not None:
+        drawn, before = [], 0.3
+        for k in range(_FEWEST_SEEDS):
+            drawn.append(simulator.draw(samples, np.random.default_rng((seed, k)))[part][::stride])
+            report(before * (k + 1) / _FEWEST_SEEDS)
+        aligned = _beginning(own.t, np.array(drawn), stride)
     measured: list[Measures] = []
     traces = np.empty((seeds, -(-own.t.size // stride)), dtype=np.float32)
     total, first = np.zeros(own.t.size), own.voltage
@@ -83,11 +90,12 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         strays += stray(v, samples.voltage) > 0.0
         measured.append(yardstick.measure(v))
         traces[k] = v[::stride]
-        report(0.6 + 0.4 * (k + 1.0) / seeds if model is None else (k + 1.0) / seeds)
+        report(before + (1.0 - before) * (k + 1.0) / seeds)
     if aligned is not None:
         notes.append(f'The level of the model was moved by {number(float(shifts.mean()), 3)} V '
                      f'(+- {number(float(shifts.std()), 2)} V), so that the mean of the first '
-                     f"{_ALIGNED:g} s of each simulation equals the recording's.")
+                     f'{number(float(np.ptp(own.t[aligned])))} s of each simulation equals the '
+                     "recording's.")
     if strays:
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')
@@ -95,6 +103,18 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     return _agreement(recording, own, yardstick, simulator, measured, path, traces, first, notes,
                       (0.0, float(own.t[0]) if model is None else 0.0), seeds, offset,
                       (float(own.t[0]), duration))
+
+
+def _beginning(t: FloatArray, drawn: FloatArray, stride: int) -> slice:
+    """Return the samples over which simulations, V (every stride-th sample), are aligned."""
+    moves = drawn - drawn.mean(axis=0)
+    span = _ALIGNED
+    while span < t[-1] - t[0]:
+        end = max(10, int(np.searchsorted(t, t[0] + span, side='right')))
+        if moves[:, :max(1, end // stride)].mean(axis=1).std() <= _STEADY * moves.std():
+            return slice(0, end)
+        span *= 2.0
+    return slice(0, t.size)
 
 
 def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
@@ -185,7 +205,7 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
         responses, [2.5, 97.5], axis=0)
     return Agreement(
         recording.name, fitted, simulated, tuple(simulator.names),
-        explained, math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
+        explained, math.sqrt(float(np.mean(error ** 2))), round(float(error.mean()), 12),
         thirds,  # type: ignore[arg-type]
         band(real.lowest, np.array([m.lowest for m in measured])),
         band(real.mean, np.array([m.mean for m in measured])), tuple(yardstick.levels),
