@@ -127,13 +127,18 @@ def _budget(analysis: Analysis) -> str:
 
 def _fall_within_budget(analysis: Analysis) -> str:
     """Return in words that the voltage fell below the limit within the budget, or ''."""
-    recording, curves = analysis.recording, analysis.by_throttle
-    k = int(np.argmin(recording.voltage))
-    # The voltage may lag behind throttle.
-    top = recording.throttle[np.searchsorted(recording.t, recording.t[k] - 0.5):k + 1].max()
-    if recording.voltage[k] >= curves.voltage or not top <= curves.budget + 0.01:
+    recording, dips = analysis.recording, analysis.overview.facts.dips
+    if dips is None:
         return ''
-    return f'; yet the voltage was below {curves.voltage:g} V at {100.0 * top:.0f} % throttle'
+    for dip in dips.deepest:
+        # The voltage may lag behind throttle.
+        begin = float(recording.t[0]) + dip.begin_s
+        first, last = np.searchsorted(recording.t, [begin - 0.5, begin + dip.seconds])
+        top = float(np.fmax.reduce(recording.throttle[first:last + 1], initial=0.0))
+        if top <= analysis.by_throttle.budget + 0.01:
+            return (f'; yet the voltage was below {dips.limit_v:g} V at {100.0 * top:.0f} % '
+                    f'throttle, at {number(dip.begin_s, 4)} s')
+    return ''
 
 
 def _why_no_throttle(analysis: Analysis) -> str:

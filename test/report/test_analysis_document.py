@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.quality import quality_list
+from ou_monitor.analysis.supply import Dip, Dips
 from ou_monitor.records import Flag, Severity
 from ou_monitor.report.analysis_document import analysis_document, answer, facts, notes
 import pytest
@@ -103,13 +104,17 @@ def test_a_missing_budget_states_its_cause(analysis, level, last, words):
 @pytest.mark.parametrize('budget, warned', [(1.0, True), (0.05, False)])
 def test_a_safe_throttle_that_did_fall_below_the_limit_is_contradicted(analysis, budget, warned):
     """The risk is a model's; the flight itself has the last word."""
-    lowest = float(analysis.recording.voltage.min())
+    v, t = analysis.recording.voltage, analysis.recording.t
+    k, lowest = int(v.argmin()), float(v.min())
+    dips = Dips(lowest + 0.01, 1, 0.01, 0.01, deepest=(
+        Dip(float(t[k] - t[0]), lowest, 0.01, float(analysis.recording.throttle[k])),))
     safe = replace(analysis, by_throttle=replace(
-        analysis.by_throttle, voltage=lowest + 0.01, budget=budget))
+        analysis.by_throttle, voltage=lowest + 0.01, budget=budget), overview=replace(
+            analysis.overview, facts=replace(analysis.overview.facts, dips=dips)))
     for words in (dict(facts(safe))['Safe up to'], ' '.join(answer(safe))):
         assert ('yet the voltage was below' in words) == warned
     assert f'At the end, safe up to {100.0 * budget:.0f} % throttle for 5 s' in words
-    above = replace(safe, by_throttle=replace(safe.by_throttle, voltage=lowest - 0.01))
+    above = replace(safe, overview=analysis.overview)
     assert 'yet the voltage' not in ' '.join(answer(above))
 
 
