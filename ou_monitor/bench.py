@@ -465,6 +465,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
             risk: float) -> tuple[Flight, SupplyFacts, Callable[..., float] | None]:
     """Return a flight in numbers, its facts, and its final risk as a function (full, level: V)."""
+    from ou_monitor.analysis.noise import remainder, without_wild
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
     from ou_monitor.online.settings import MonitorSettings
@@ -477,7 +478,9 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
                          '--throttle and --set without --from')
     monitor = None
     if level is not None:
-        monitor, parts = node_for(recording, MonitorSettings(
+        # The same samples as in `analyze`.
+        clean, _ = without_wild(recording, remainder(recording))
+        monitor, parts = node_for(clean, MonitorSettings(
             window=SLIDING, brownout_voltage=level, brownout_horizon=horizon,
             brownout_budget_limit=risk, brownout_critical=max(risk, 0.5)))
         deque(parts, 0)
