@@ -133,7 +133,7 @@ def _fall_within_budget(analysis: Analysis) -> str:
     for dip in dips.deepest:
         # The voltage may lag behind throttle.
         begin = float(recording.t[0]) + dip.begin_s
-        first, last = np.searchsorted(recording.t, [begin - 0.5, begin + dip.seconds])
+        first, last = np.searchsorted(recording.t, [begin - 1.0, begin + dip.seconds])
         top = float(np.fmax.reduce(recording.throttle[first:last + 1], initial=0.0))
         if top <= analysis.by_throttle.budget + 0.01:
             return (f'; yet the voltage was below {dips.limit_v:g} V at {100.0 * top:.0f} % '
