@@ -78,6 +78,9 @@ class SupplyMonitor:
                  look: float = LOOK, replay: bool = False) -> None:
         self._settings = settings or MonitorSettings()
         self._background, self._look, self._replay = background, look, replay
+        if model is not None and not hasattr(model, 'load'):
+            raise TypeError(f'model: a SupplyModel is needed, got a {type(model).__name__}; that '
+                            'of a file is read_model(path).model')
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()

@@ -11,7 +11,9 @@ from ou_monitor.online.load.supply_load import LoadStatus
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import monitor_settings, MonitorSettings
+from ou_monitor.recordings.model_file import read_model
 from ou_monitor.records import Level, Status
+from project import ROOT
 import pytest
 
 
@@ -357,3 +359,9 @@ def test_the_default_limit_on_another_supply_is_a_warning(limit, supply, warned)
     report = monitor.report(age=0.0)
     assert ('set brownout.voltage' in report.summary) is warned
     assert report.level is (Level.WARN if warned else Level.OK)
+
+
+def test_a_model_file_in_place_of_its_model_is_refused():
+    """It failed only later, without a hint."""
+    with pytest.raises(TypeError, match='read_model'):
+        SupplyMonitor(MonitorSettings(), read_model(ROOT / 'models/gecko.yaml'))
