@@ -196,8 +196,8 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                       + (f'; times the largest current: {fall}'
                          if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
-        lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '
-                      'to bypass its sensor'))
+        lines.append(('Resistance', 'unknown: the current changes too little or too seldom, or a '
+                      'load seems to bypass its sensor'))
     lines.append(('Relaxation', _ou_words(found.facts.ou, found.whole)))
     if found.line is not None:
         line = found.line
