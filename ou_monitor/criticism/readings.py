@@ -15,6 +15,7 @@ from ou_monitor.model.load_fit import timing
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, supplied
+from scipy.special import chdtri
 
 # Minimum distance of an outlier from the median: in standard deviations, and as a multiple of the
 # distance of the next closer sample.
@@ -38,6 +39,8 @@ _MOST, _EDGE = 1.5, 0.05
 # Maximum gap in a current, s; quantile of its size taken as full load; lags of the mean response
 # to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
+# Probability that an unrelated current is taken as the load if there is no throttle.
+_CHANCE = 0.02
 # Minimum autocorrelation of which a decay is taken.
 _CORRELATED = 0.1
 # Two levels of a voltage: minimum distance, in standard deviations about them and in ADC steps;
@@ -108,7 +111,9 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     gain = _gain(t[some], v[some], current[some]) - (
         0.0 if u is None else _gain(t[some], v[some], u[some]))
     limit = 0.5 * _LAGS.size * math.log(v.size)
-    if not full or gain < (limit if u is None else -limit):
+    # Without throttle it only has to be related: causes over load have to earn their place.
+    least = 0.5 * float(chdtri(2 + _LAGS.size, _CHANCE)) if u is None else -limit
+    if not full or gain < least:
         notes += moved
         return u, NAN
     why = 'throttle was not recorded' if u is None else (

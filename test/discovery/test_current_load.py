@@ -85,8 +85,10 @@ def test_one_step_of_the_current_on_a_rail_is_its_load():
     rng = np.random.default_rng(2)
     noise = SupplyModel((OU(40.0, 0.125, 5.0), MeasurementNoise(0.004))).simulate(t, rng)
     current = 0.6 + 1.5 * (t > 9.0) + 0.004 * rng.standard_normal(t.size)
+    wander = SupplyModel((OU(2.0, 0.028, 0.0),)).simulate(t, rng)
     nothing = np.full(t.size, np.nan)
     for v, used in ((noise - 0.055 * current, True), (noise, False),
+                    (noise + wander - 0.055 * current, True), (noise + wander, False),
                     (noise - 0.08 * (t > 13.0), False)):
         _, full = load_of(Recording(t, v, nothing, '', current=current), t, v, None, [])
         assert math.isfinite(full) == used
