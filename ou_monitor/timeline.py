@@ -308,7 +308,7 @@ def _unsigned(recording: Recording) -> Recording:
         return recording
     return replace(recording, throttle=np.abs(u), notes=(*recording.notes, (
         f'Throttle runs from {float(np.nanmin(u)):.3g} to {float(np.nanmax(u)):.3g}, and the '
-        'voltage falls in both directions: its absolute value is used.')))
+        'voltage falls in both directions: its absolute value is used. The node needs it so.')))
 
 
 def _explained(y: FloatArray, x: FloatArray) -> float:
