@@ -112,6 +112,8 @@ def test_a_result_has_the_attributes_of_its_record(found):
     assert finding.causes is finding.record.causes and not hasattr(finding, 'nonsense')
     assert str(finding) == terminal(finding.document())
     assert repr(finding).startswith('<Finding: A plain simulation lacks')
+    assert 'levels' in dir(found['analyze'])
+    assert found['analyze'].headline == found['analyze'].to_dict()['headline']
 
 
 def frame(monkeypatch, result):

@@ -77,6 +77,15 @@ class Result:
             raise AttributeError(name)
         return getattr(self.record, name)
 
+    def __dir__(self) -> list[str]:
+        """Return the names of all attributes, those of the record included."""
+        return sorted({*super().__dir__(), *dir(self.record)})
+
+    @property
+    def headline(self) -> str:
+        """Return the answer in words, as on the first screen."""
+        return self.document().headline
+
     def to_dict(self) -> dict[str, Any]:
         """
         Return all numbers, equal to the command's `--json`.
