@@ -167,6 +167,10 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
 
 
+# Minimum ratio of the noise to the median at steady throttle that errors of both do not explain.
+_MIXED = 1.2
+
+
 def _numbers(analysis: Analysis) -> list[str]:
     whole, recording = analysis.overview.whole, analysis.recording
     ou = whole or analysis.overview.facts.ou
@@ -190,6 +194,12 @@ def _numbers(analysis: Analysis) -> list[str]:
     ends = np.array([e.interval('alpha') for e in steady]).reshape(-1, 2)
     if steady and ((ends[:, 1] < low).all() or (ends[:, 0] > high).all()):
         differing.append(f'tau is {_range([1e3 / e.alpha for e in steady])} ms')
+    # The steady noise includes white noise, so the relaxation alone cannot exceed it.
+    noise = analysis.overview.facts.noise
+    calm = [1e3 * x for u, x in zip(noise.throttle, noise.steady_rms_v)
+            if noise.flown[0] <= u <= noise.flown[1] and math.isfinite(x)]
+    if calm and 1e3 * math.sqrt(ou.var_inf) > _MIXED * float(np.median(calm)):
+        differing.append(f'the noise is {_range(calm)} mV rms')
     if differing:
         where = ('At steady throttle' if analysis.recording.has_throttle else
                  'Over the whole recording')

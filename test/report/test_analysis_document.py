@@ -1,6 +1,7 @@
 """The report of `analyze`: its records, the most important first."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
@@ -130,3 +131,15 @@ def test_a_sigma_above_that_of_every_level_is_explained(analysis, factor, lower)
     assert ('At steady throttle sigma is' in ' '.join(answer(found))) == lower
     bare = replace(found.recording, throttle=np.full(found.recording.n, np.nan))
     assert 'steady throttle' not in ' '.join(answer(replace(found, recording=bare)))
+
+
+@pytest.mark.parametrize('ratio', [0.9, 0.5])
+def test_noise_far_above_that_at_steady_throttle_includes_transients(analysis, ratio):
+    """A noise of 44 mV beside 35 at steady throttle was said without a word; truth 30."""
+    seen = analysis.overview
+    ou = replace(seen.facts.ou, status='ok', alpha=60.0, alpha_95=(50.0, 70.0), var_inf=1e-3,
+                 sigma=0.01, sigma_95=(0.009, 0.011))
+    noise = replace(seen.facts.noise, steady_rms_v=(ratio * math.sqrt(1e-3),) * 11)
+    found = replace(analysis, overview=replace(
+        seen, facts=replace(seen.facts, ou=ou, noise=noise)))
+    assert ('At steady throttle the noise' in ' '.join(answer(found))) == (ratio < 0.8)
