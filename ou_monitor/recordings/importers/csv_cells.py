@@ -77,7 +77,7 @@ _MONTHS = 'jan feb mar apr may jun jul aug sep oct nov dec'
 _MONTH = re.compile(rf"[- ]({_MONTHS.replace(' ', '|')})[a-z]*[- ]", re.IGNORECASE)
 # A time span: 0 days 00:00:01.5
 _DAYS = re.compile(r'(\d{1,2}) days?,? \+?(\d\d?):')
-CHANNEL = re.compile(r'(?:ch|channel|chan|kanal|analog)[_ ]?[0-9a-d]|a[0-3]', re.IGNORECASE)
+CHANNEL = re.compile(r'(?:ch|channel|chan|kanal|analog|ain)[_ ]?[0-9a-d]|a[0-3]', re.IGNORECASE)
 
 
 def number_of(cell: str) -> tuple[float, str]:

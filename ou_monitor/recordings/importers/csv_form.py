@@ -54,6 +54,8 @@ _IN_A_ROW = 8
 # First characters of a comment line.
 COMMENTS = ('#', '%')
 DELIMITERS = {'tab': '\t', 'space': ' '}
+# Label before the names of channels.
+_OF_NAMES = re.compile('name|trace|label|channel', re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 # A number with points or commas between thousands, not a part of a date or a clock.
 _OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
@@ -167,17 +169,15 @@ def _encoding(path: Path, head: bytes) -> str:
                          'damaged from there on')
     if nul or kind.startswith('it is') and kind != TEXT:
         raise InputError(f'{path} is not text: {kind}')
-    try:
-        codecs.getincrementaldecoder('utf-8')().decode(head)
-    except UnicodeDecodeError:
-        # Chinese names take two bytes a character; µs and °C of older Windows programs, one.
-        runs = [len(run) for run in re.findall(rb'[\x80-\xff]+', head)]
+    # Chinese names take two bytes a character; µs and °C of older Windows programs, one, of which
+    # Japanese names have some that Windows lacks.  Latin-1 has all.
+    runs = [len(run) for run in re.findall(rb'[\x80-\xff]+', head)]
+    chinese = max(runs, default=0) >= 4 and not any(run % 2 for run in runs)
+    for name in ('utf-8', *(['gb18030'] if chinese else []), 'cp1252', 'cp932'):
         with suppress(UnicodeDecodeError):
-            if max(runs) >= 4 and not any(run % 2 for run in runs) and (
-                    codecs.getincrementaldecoder('gb18030')().decode(head)):
-                return 'gb18030'
-        return 'cp1252'
-    return 'utf-8'
+            codecs.getincrementaldecoder(name)().decode(head)
+            return name
+    return 'latin-1'
 
 
 def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, mark: str,
@@ -222,7 +222,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
         encoding, delimiter, comma, mark, first, at, labels, ''.join(lines[:first]),
-        tuple(names), _units_of(names, words, rows, first), width, indent, first_rows, step,
+        tuple(names), _units_of(names, words, rows, first, at), width, indent, first_rows, step,
         stated)
 
 
@@ -255,6 +255,11 @@ def _joined(row: list[str], names: int) -> list[str]:
     """Return the numbers of a row of twice as many whole numbers as names, else no cells."""
     split = len(row) == 2 * names and all(map(re.compile(r'[-+]?\d+').fullmatch, row))
     return [f'{whole}.{part}' for whole, part in zip(row[::2], row[1::2])] if split else []
+
+
+def _trimmed(row: list[str]) -> list[str]:
+    """Return a row without the blank cells at its end."""
+    return row[:max((k + 1 for k, cell in enumerate(row) if cell), default=0)]
 
 
 def _of_table(row: list[str], indent: int) -> list[str]:
@@ -338,10 +343,12 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     # A line of decimal numbers, as of the steps of a battery tester, has no names.
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
         '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
+    needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
     if facts:
-        # The names of the columns are one of the facts.
-        plain = [(k, row) for k, row in plain if len(row) == width and re.search(
-            'name|trace|label|channel', row[0].lower()) and not any(map(is_value, row))][:1]
+        # The names of the columns are one of the facts, the last of the longest.
+        plain = sorted(((k, row) for k, row in ((k, _trimmed(row)) for k, row in plain)
+                        if len(row) in (width, len(needed) + 1) and _OF_NAMES.search(row[0])
+                        and not any(map(is_value, row))), key=lambda one: len(one[1]))[-1:]
     if any(labels) and not (plain and len(plain[-1][1]) == width):
         return [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
                 for k, (label, cell) in enumerate(zip(labels, rows[first]))], [], first + 1
@@ -353,16 +360,30 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
         either = next(csv.reader([text], delimiter=delimiter), []), _NAMES.findall(text)
         comments += [(k, [cell.strip() for cell in cells])
                      for cells in either if len(cells) == width > 1][:1]
-    needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
-    return next((found for above in (plain, comments) if (
+    names, units, line = next((found for above in (plain, comments) if (
         found := _names_and_units(above, width, needed))), (
             [f'column {k + 1}' for k in range(width)], [], 0))
+    # A label before the names, as before the numbers of another line, is the name of no column.
+    some = _trimmed(names)
+    labelled = needed and needed == {*range(len(some) - 1)} and _OF_NAMES.search(some[0]) and any(
+        list(map(is_value, _trimmed(row))) == [False] + [True] * len(needed)
+        for row in rows[skip:first])
+    return some[1:] if labelled else names, units, line
 
 
 def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set[int],
                      ) -> tuple[list[str], list[str], int] | None:
     """Return the same as `_header`; None if no line names all columns."""
     units: list[str] = []
+
+    def names_all(row: list[str]) -> bool:
+        named = {row[k] for k in needed if k < len(row)} - {''}
+        return len(named) == len(needed) and not any(map(is_value, named))
+
+    if above and not names_all(above[-1][1]):
+        # Below the line of units, one of sources may follow.
+        above = next((above[:k + 1] for k in range(len(above) - 1, 0, -1) if _are_units(
+            above[k][1]) and names_all(above[k - 1][1])), above)
     if len(above) > 1 and _are_units(above[-1][1]) and len(above[-2][1]) >= min(
             width, len(above[-1][1])):
         units = [cell.strip('[](){} ').lower() for cell in above.pop()[1]]
@@ -387,14 +408,18 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
     return names, units, line + 1
 
 
-def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: int,
+def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: int, at: int,
               ) -> tuple[str, ...]:
     """Return the stated unit of each column (words: the line of units), '' if there is none."""
-    stated = [words[k] if k < len(words) and words[k] in WORDS else unit_of(name)[1]
+    # Names such as V beside A are units.
+    bare = {'V', 'mV', 'A', 'mA'}.intersection(names)
+    stated = [words[k] if k < len(words) and words[k] in WORDS else name.lower()
+              if name in bare and len(bare) > 1 else unit_of(name)[1]
               for k, name in enumerate(names)]
     # Else the unit of a channel in a line above, such as 'Vertical Units,V,CH2:A'.
+    begin = int(rows[at - 1][1:len(names) + 1] != names)
     for k, cell in ((k, cell) for row in rows[:first] if row and 'unit' in row[0].lower()
-                    for k, cell in enumerate(row[1:len(stated)], 1) if not stated[k]):
+                    for k, cell in enumerate(row[1:], begin) if k < len(stated) and not stated[k]):
         word = cell.split(':')[-1].strip().lower()
         stated[k] = word if word in VOLT_WORDS or word in AMPERE_WORDS else ''
     # Else the unit behind the first number of the column.
@@ -458,7 +483,8 @@ def numbers(path: Path, form: Form, places: Sequence[int],
     last = max([*places, *(texts or {}), *(place + 1 for place in with_unit)])
     width = len(form.names)
     try:
-        with opened(path) as raw, io.TextIOWrapper(raw, form.encoding, newline=None) as file:
+        with opened(path) as raw, io.TextIOWrapper(raw, form.encoding, (
+                'strict' if form.encoding.startswith('utf') else 'replace'), None) as file:
             for begin, block in _blocks(path, file, form, width):
                 rows = block
                 if len(rows[0]) <= last or len(rows[0]) > width or len(set(map(len, rows))) > 1:

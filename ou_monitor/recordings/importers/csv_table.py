@@ -23,7 +23,7 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
     AMPERE_WORDS, CHANNEL, clock_times, factor_of, first_word, has_day, is_clock, is_missing,
-    is_number, is_value, number_of, SCALES, SHARE_WORDS, shown, TIME_WORDS, unit_of,
+    is_number, is_value, number_of, OTHER_WORDS, SCALES, SHARE_WORDS, shown, TIME_WORDS, unit_of,
     VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, numbers, THROTTLE, TIME, VOLTAGE)
@@ -62,6 +62,8 @@ _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 _ROUNDING, _SURE = 1e-6, 4.0
 # A voltage without a unit above this is in mV: no craft's pack has that many volts.
 _MOST_VOLTS = 1000.0
+# Maximum of an unknown throttle up to which it is not taken as percent: levers give up to 5 V.
+_LEAST_PERCENT = 5.5
 
 
 # Quantity -> patterns of the end of a column's name without its unit, the best first; in lower
@@ -101,6 +103,8 @@ _PATTERNS = {
         r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }
+_UNITS = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
+          logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}
 # Exports with unscaled numbers.  Column that reveals the program ('': any program) -> end of a
 # column's name, in lower case -> factor, unit, and the number that stands for "unknown".
 # Betaflight's blackbox explorer: us, 0.01 V and 0.01 A, as logged from version 4.0 on.  MAVLink:
@@ -316,9 +320,13 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
     """Return the error for a missing column."""
-    hint = nearest(name, form.names) if form.line else (
-        f'the first line holds numbers; add a header {TIME},{VOLTAGE}[,{THROTTLE}] or give '
-        "'column 1'")
+    if not form.line and sum(len(row) != form.width for row in form.rows) > _BACK * len(form.rows):
+        hint, option = ('its lines have different numbers of cells: keep those of one kind in a '
+                        'file of their own'), ''
+    else:
+        hint = nearest(name, form.names) if form.line else (
+            f'the first line holds numbers; add a header {TIME},{VOLTAGE}[,{THROTTLE}] or give '
+            "'column 1'")
     return f"{path}:{form.line or form.skip + 1}: no column '{name}': {hint}" + option
 
 
@@ -328,16 +336,20 @@ def _column_place(path: Path, form: Form, name: str, option: str) -> int:
     return form.names.index(name)
 
 
+def _plain_names(form: Form) -> list[str]:
+    """Return the names without units, as the patterns have them."""
+    return [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') or 'time' * bool(
+        unit) for name, unit in zip(form.names[:form.width], form.units)]
+
+
 def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = False
             ) -> list[int]:
     """Return the candidate columns of a quantity, the best first (text: those of words)."""
-    plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') or 'time' * bool(
-        unit) for name, unit in zip(form.names[:form.width], form.units)]
+    plain = _plain_names(form)
     ends = [re.sub(r'\W+', '_', re.split(
         r'[/.:](?=[^/.:])(?![^\[(]*[\])]$)', name.strip().lower())[-1]).strip('_')
         for name in form.names[:form.width]]
-    right = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
-             logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}[quantity]
+    right = _UNITS[quantity]
     free = [k for k in range(len(plain)) if k not in taken and form.names[k]
             and _holds_numbers(form, k, quantity == _TIME_NAME) is not text]
     for pattern in _PATTERNS[quantity]:
@@ -509,9 +521,6 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             continue
         if name is not None:
             place = _column_place(path, form, name, option)
-            if quantity == logs.VOLTAGE and unit is None and form.units[place] in AMPERE_WORDS:
-                raise InputError(f"{path}: '{name}' has a unit of current: name a column of "
-                                 'volts, or give --unit')
             found[quantity] = _unit_column(form, place, unit)
             continue
         places = _choose(form, quantity, taken)
@@ -533,6 +542,16 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
                              f'{quantity}: name another with --{quantity}-column or '
                              f'--{owners[place]}-column')
         owners[place] = quantity
+        stated = form.units[place] or ''.join(
+            re.split(r'[\[({]', column.name.lower())[1:][-1:]).rstrip('])} ')
+        name, _, unit = names[quantity]
+        if name and not unit and stated in {*WORDS, *OTHER_WORDS} - {'', '-', *_UNITS[quantity]}:
+            kind = next((f'a unit of {one} (--{one}-column)' for one, words in _UNITS.items()
+                         if stated in words), f"the unit '{stated}'")
+            more = {logs.VOLTAGE: ', or give --unit',
+                    logs.THROTTLE: ', or give its ends by --throttle-unit LOW:HIGH'}
+            raise InputError(f"{path}: '{name}' has {kind}: name a column of "
+                             f'{quantity}{more.get(quantity, "")}')
     if needed and logs.VOLTAGE not in found:
         raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column)'))
     return found
@@ -626,8 +645,8 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
         if np.mean(within <= 0.0) <= WILD and (overlap or np.mean(np.diff(which) != 0) > _BACK):
             raise InputError(
                 f"{path}: '{column}' holds several series, named in '{label}': "
-                f'{shown(some(map(printable, names), 3))}; name one with '
-                '--voltage-column, or keep the rows of one')
+                f'{shown(some(map(printable, names), 3))}; '
+                f'{"name one with --voltage-column, or " * bool(form.line)}keep the rows of one')
 
 
 def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
@@ -757,7 +776,7 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
     if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
         return '1'
     if high <= 110.0:
-        return '%'
+        return '%' if high > _LEAST_PERCENT else '1'
     negative = float(np.mean(values < -MOST_THROTTLE)) > WILD
     if np.quantile(known[known > 0.0], WILD) >= 800.0 and high <= 2200.0 and not negative:
         return 'us'
@@ -794,9 +813,12 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''
     if lacking:
         # Mention columns that may be a throttle or current under another name.
+        plain = _plain_names(form)
         rest = [*words_of, *(
             name for k, name in enumerate(form.names[:form.width])
             if k not in used and name not in others
+            and not any(re.fullmatch(one, plain[k] or ' ') for one in _PATTERNS[_TIME_NAME])
+            and form.units[k] not in TIME_WORDS.keys() - _PULSE_WORDS.keys()
             and (logs.THROTTLE in lacking or re.search('curr|amps|strom|cour', name.lower()))
             and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
             and (not form.rows or any(

@@ -366,6 +366,22 @@ FORMS = {
          '"Log Date","28/11/2026",,', '"Log Time","10:38:24",,', '"Rate","50.000","Hz",', '', '',
          '"Time","Throttle Pos","Battery Voltage","Battery Current"', '"s","%","V","A"', '', ''],
         lambda k: f'"{0.02 * k:.3f}","{100 * U[k]:.1f}","{V[k]}","{AMPS[k]}"'), 0.02, True, True),
+    # A line of sources below the line of units.
+    'racechrono': (table(
+        ['Format,3', '', 'timestamp,lap_number,elapsed_time,speed,battery_voltage,'
+         'battery_current,throttle_pos', 'unix time,,s,m/s,V,A,%',
+         ',,,100: gps,200: obd,200: obd,200: obd'],
+        lambda k: f'{1.7e9 + 0.04 * k:.3f},1,{0.04 * k:.3f},0,{V[k]},{AMPS[k]},{100 * U[k]:.1f}'),
+        0.04, True, True),
+    # Text of Japanese Windows.
+    'graphtec_jp': (table(['No.,測定開始', '番号,経過時間[s],電圧[V],電流[A]'],
+                          lambda k: f'{k},{0.1 * k:.1f},{V[k]},{AMPS[k]}').encode('cp932'), 0.1,
+                    False, True),
+    # Names that are units; an analog input, of which the first is the voltage.
+    'cycle_analyst': (table(['Time (s)\tAh\tV\tA\tS'], lambda k: (
+        f'{k}\t{0.01 * k:.4f}\t{V[k]}\t{AMPS[k]}\t0.0')), 1.0, False, True),
+    'labjack': (table(['Time\tAIN0\tAIN1'], lambda k: (
+        f'{0.05 * k:.3f}\t{V[k]}\t0.01')), 0.05, False, False),
     'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
         f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
 }
@@ -461,6 +477,82 @@ def test_the_explorer_of_blackboxes_writes_the_units_of_the_firmware(
     np.testing.assert_allclose(found.current, 3.0)
 
 
+@pytest.mark.parametrize('row', ['{},{},', '{},{}', ',{},{}'])
+@pytest.mark.parametrize('end', ['', ','])
+@pytest.mark.parametrize('first', [0, 5])
+def test_a_label_before_the_names_is_not_the_name_of_the_first_column(row, end, first, tmp_path):
+    """Facts above the rows hold a label and a cell of each channel; `CH1` is the first."""
+    facts = ['Model Name,DLM2024', 'Version,1.60', 'Comment,', 'Block Number,1', 'History,1',
+             'SampleRate,1E+03,1E+03', 'HOffset,0.0,0.0', 'Block Size,60,60', 'VUnit,V,A',
+             'TraceName,CH1,CH2'][first:]
+    path = written(tmp_path, table([*(f'{fact}{end}' for fact in facts), ''],
+                                   lambda k: row.format(V[k], AMPS[k])))
+    found = read_recording(path)
+    np.testing.assert_allclose(found.voltage, V)
+    np.testing.assert_allclose(found.current, AMPS)
+    assert found.source['voltage'] == 'CH1'
+    # A column that is only blank has its own name.
+    path = written(tmp_path, table(['Version,1,2', 't,U,I'], lambda k: f'{k},{V[k]},'))
+    np.testing.assert_allclose(read_recording(path).voltage, V)
+
+
+def test_bytes_of_unknown_tables_do_not_stop_the_reading(tmp_path):
+    """Old tables have bytes that Windows lacks, at the beginning or later; names may suffer."""
+    path = written(tmp_path, table(['t [s],Batt\u00fc [V]'],
+                                   lambda k: f'{k},{V[k]}').encode('cp437'))
+    np.testing.assert_allclose(read_recording(path).voltage, V)
+    rows = ''.join(f'{k},{V[k % N]},gr\u00fcn\n' for k in range(9000))
+    path = written(tmp_path, f't,U,note\n{rows}'.encode('cp1252') + b'9000,12.0,\x81\n')
+    assert read_recording(path).n == 9001
+    path = written(tmp_path, f't,U,note\n{rows}'.encode('cp1252') + b'9000,12\x81,\n')
+    with pytest.raises(InputError, match="9002: column 'U' holds '12"):
+        read_recording(path)
+
+
+def test_utf_16_needs_no_mark_of_its_byte_order(tmp_path):
+    text = table(['Zeit;Spannung [V]'], lambda k: f'{german(k / 8)};{german(V[k])}')
+    found = read_recording(written(tmp_path, text.encode('utf-16-le')))
+    np.testing.assert_allclose(found.voltage, V)
+    assert 'utf-16-le' in found.notes[0]
+
+
+def test_a_date_and_a_clock_are_one_time(tmp_path):
+    path = written(tmp_path, 'Datum;Uhrzeit;U\n16.05.2024;23:59:59,5;12\n'
+                             '19.05.2024;00:00:00,5;13\n19.05.2024;00:00:02,0;14\n')
+    np.testing.assert_allclose(np.diff(read_recording(path).t), [172801.0, 1.5])
+
+
+@pytest.mark.parametrize('name, given, words', [
+    ('I (A)', {'throttle': 'I (A)'}, r'a unit of current \(--current-column\):.*--throttle-unit'),
+    ('P [W]', {'throttle': 'P [W]'}, "the unit 'w': name a column of throttle"),
+    ('dt (s)', {'throttle': 'dt (s)'}, r'a unit of time \(--time-column\)'),
+    ('soc (%)', {'voltage': 'soc (%)'}, 'a unit of throttle .* or give --unit'),
+    ('U2 [mV]', {'current': 'U2 [mV]'}, 'a unit of voltage .* name a column of current$')])
+def test_a_named_column_of_another_quantity_is_refused(name, given, words, tmp_path):
+    """Unless its unit or ends are given."""
+    path = written(tmp_path, table([f'time_s,voltage_v,{name}'], lambda k: f'{k},{V[k]},{U[k]}'))
+    with pytest.raises(InputError, match=words):
+        read_recording(path, columns=CsvColumns(**given))
+    if 'throttle' in given:
+        found = read_recording(path, columns=CsvColumns(throttle_unit='0:0.5', **given))
+        np.testing.assert_allclose(found.throttle, 2.0 * U)
+
+
+@pytest.mark.parametrize('kind, words', [
+    ('2', 'keep the rows of one$'), ('quad', 'keep those of one kind in a file of their own$')])
+def test_lines_of_several_kinds_are_refused(kind, words, tmp_path):
+    """Mission Planner: a name before each number; the lines of one message can be read."""
+    status = [f'{clock(k)},FD,status,load,312,voltage_battery,{1e3 * V[k]:.0f},len,43\n'
+              for k in K]
+    hud = [f'{clock(k)},FD,vfr_hud,alt,12.{k},len,32\n' for k in K]
+    beat = [f'{clock(k)},FD,heartbeat,type,{kind}\n' for k in K]
+    with pytest.raises(InputError, match=words):
+        read_recording(written(tmp_path, ''.join(map(''.join, zip(status, hud, beat)))))
+    found = read_recording(written(tmp_path, ''.join(status)), columns=CsvColumns(
+        voltage='column 7', unit='mV'))
+    np.testing.assert_allclose(found.voltage, V, atol=6e-4)
+
+
 def test_labels_are_names_only_if_each_row_has_them(tmp_path):
     """A header has priority, and a number with the label of another is refused."""
     rows = ''.join(f'{0.01 * k:.2f},12.5,MODE:{k % 3}\n' for k in range(N))
@@ -532,6 +624,11 @@ def test_the_unit_of_a_throttle(tmp_path):
     # Pulses in ms.
     pulses = written(tmp_path, 't,U,Throttle\n0,12,1.1\n1,12,1.9\n', 'd.csv')
     np.testing.assert_allclose(read_recording(pulses).throttle, [0.1, 0.9])
+    # The output of a lever, in V, is no percentage.
+    lever = written(tmp_path, rows.replace('1100', '0.9').replace('1500', '2.0').replace(
+        '1900', '4.1'), 'g.csv')
+    with pytest.raises(InputError, match='throttle runs from 0.9 to 4.1'):
+        read_recording(lever)
     # A stick at rest.
     stick = written(tmp_path, 't,U,Thr\n0,12,-1024\n1,12,-1024\n', 'f.csv')
     np.testing.assert_allclose(read_recording(stick).throttle, [0.0, 0.0])
@@ -771,7 +868,10 @@ def test_a_counter_of_32_bits_goes_on(pause, span, tmp_path):
 @pytest.mark.parametrize('header, row, words', [
     ('t,U,load', '{0},12,\n{0}.1,,{0}', 'load (--throttle-column or --current-column)'),
     ('t,U,throttle,gyro,rotor current', '{0},12,0.5,{0},{0}', 'rotor current (--current-column)'),
-    ('t,name,state', '{0},vbat,12\n{0},load,{0}', 'load (--throttle-column or --current-column)')])
+    ('t,name,state', '{0},vbat,12\n{0},load,{0}', 'load (--throttle-column or --current-column)'),
+    # Another time is not offered.
+    ('t,U,step time,x (s),load', '{0},12,{0},{0},{0}',
+     'load (--throttle-column or --current-column)')])
 def test_columns_that_may_be_throttle_or_current_are_named(header, row, words, tmp_path):
     """Though in rows of their own, or beside a throttle that was found; not if given as none."""
     path = written(tmp_path, '\n'.join([header, *map(row.format, range(9))]))
