@@ -80,8 +80,8 @@ _PATTERNS = {
         r'.*(?:time|zeit|stamp).*', r'date|datum'),
     logs.VOLTAGE: (
         r'voltage_v',
-        r'v_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|volts|'
-        r'voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
+        r'[uv]_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|'
+        r'volts|voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
         r'|v_?bus|vfas|cels|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
         r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?',

@@ -248,6 +248,7 @@ FORMS = {
     'libreoffice_de': (table(['Zeit (s),Spannung (V),Strom (A),Gas'], lambda k: ','.join(
         f'"{german(x)}"' if x % 1.0 else f'{x:.0f}' for x in (0.01 * k, V[k], AMPS[k], U[k]))),
                        0.01, True, True),
+    'robot': (table(['t,Ubat,duty'], lambda k: f'{0.01 * k},{V[k]},{U[k]}'), 0.01, True, False),
     'airdata_sticks': (table(['time(millisecond),voltage(v),rc_throttle(percent)'], lambda k: (
         f'{10 * k},{V[k]},{200 * U[k] - 100:.1f}')), 0.01, True, False),
     # Each row names the series of its value.
