@@ -284,7 +284,7 @@ _COMPARE = Command(
     'ou_monitor.cli.recorded:compare',
     'Simulate a recording many times under its own throttle, and compare: mean path, lowest '
     'voltage, falls through low levels, spectrum, response to throttle, distribution. '
-    'Without --model, a model is fitted to the part before S, and the rest is simulated.',
+    'Without --model, a model is fitted to the part before --fit-until; the rest is simulated.',
     (RECORDING, *PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
             help='simulate this model, as discover --save-model writes it; its level is moved to '
@@ -477,8 +477,8 @@ _SIMULATE = Command(
             help='factor on the response to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),
      Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
-            help='print the model in the parameters of another simulator, and what these omit '
-            'under --throttle: gazebo, px4, ardupilot, json'),
+            help='print the parameters of the model for another simulator (gazebo, px4, '
+            'ardupilot, json), and what they omit under --throttle'),
      Option('--full-current', metavar='A', type=POSITIVE, default=math.nan,
             help='with --export: current at full throttle'),
      Option('--output', metavar='PATH', type=path_argument,

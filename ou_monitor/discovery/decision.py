@@ -99,9 +99,9 @@ def affordable(kind: Kind, cost: float) -> bool:
 # -- acceptance of trials
 
 def least_evidence(kind: Kind, largest: float, again: int = 0) -> float:
-    """Return the minimum evidence of a response of the mean, nats (largest: evidence of all)."""
-    # again: samples, if the model has a term of this kind, so that another may only correct its
-    # form; 0 if not.
+    """Return the minimum evidence of a response of the mean, nats (largest: of all together)."""
+    # again: number of samples if the model already has a term of this kind, because another one
+    # may only correct its form; otherwise 0.
     least = min(FORM * largest, VISIBLE * again)
     return max(ACCEPT, kind.LEAST_SHARE * largest, least)
 

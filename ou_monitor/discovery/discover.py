@@ -54,7 +54,7 @@ _BLIND = 1.0
 
 def discover(recording: Recording, *, seed: int = 0,
              progress: Progress | None = None) -> Finding:
-    """Criticise the simulation of a recording, name causes, extend its model; see `ou_monitor`."""
+    """Criticise a recording's simulation, name causes, extend its model: `ou_monitor.discover`."""
     while True:
         try:
             found = _discover(recording, seed, progress)

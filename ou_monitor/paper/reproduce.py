@@ -153,8 +153,8 @@ def _steps() -> str:
             f'{vpp.high:.4g} mV, and every Vrms ({", ".join(map(str, vrms.multiples))}) of '
             f'{vrms.low:.4g} to {vrms.high:.4g} mV; by chance that would happen once in '
             f'{1 / vpp.chance:.0f} and {1 / vrms.chance:.0f} cases. Half a step of Vrms is '
-            f'{halves}. With this and the interval of alpha, sigma is {sigmas} V/sqrt(s). '
-            f'Motors off, "{published.IDLE.vrms.text}" beside Vpp = {published.IDLE.vpp.text} mV '
+            f'{halves}. With this and the interval of alpha, sigma is {sigmas} V/sqrt(s). With '
+            f'motors off, "{published.IDLE.vrms.text}" beside Vpp = {published.IDLE.vpp.text} mV '
             'is a reading below one step.')
 
 

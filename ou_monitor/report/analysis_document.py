@@ -142,7 +142,7 @@ def _fall_within_budget(analysis: Analysis) -> str:
 
 
 def _why_no_throttle(analysis: Analysis) -> str:
-    """Return why no throttle is safe: last reading, flight before, or voltage at rest."""
+    """Return when no throttle is safe, in words: at the end, after this flight, or at idle."""
     rest, last = analysis.overview.load.level, float(analysis.recording.voltage[-1])
     if last < analysis.by_throttle.voltage < rest:
         return f'at the end of this recording, where the voltage is {number(last, 4)} V'
@@ -167,7 +167,7 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
 
 
-# Minimum ratio of the noise to the median at steady throttle that errors of both do not explain.
+# Minimum ratio of the noise to its median at steady throttle that is more than their errors.
 _MIXED = 1.2
 
 

@@ -169,8 +169,8 @@ def _encoding(path: Path, head: bytes) -> str:
                          'damaged from there on')
     if nul or kind.startswith('it is') and kind != TEXT:
         raise InputError(f'{path} is not text: {kind}')
-    # Chinese names take two bytes a character; µs and °C of older Windows programs, one, of which
-    # Japanese names have some that Windows lacks.  Latin-1 has all.
+    # A Chinese character takes two bytes; the µ and ° of an older Windows program take one.  Some
+    # bytes of Japanese names do not exist in cp1252; Latin-1 has all bytes.
     runs = [len(run) for run in re.findall(rb'[\x80-\xff]+', head)]
     chinese = max(runs, default=0) >= 4 and not any(run % 2 for run in runs)
     for name in ('utf-8', *(['gb18030'] if chinese else []), 'cp1252', 'cp932'):
@@ -317,7 +317,7 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
-    """Return lines with decimal points, comments blanked; between blanks, single blanks."""
+    """Return lines with decimal points, comments emptied, and delimiting blanks made single."""
     lines = ['\n' if line.lstrip().startswith(COMMENTS) else line for line in lines]
     if lines and _RECEIVED.match(lines[0]):
         lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
@@ -340,12 +340,12 @@ def _with_point(text: str) -> str:
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
             skip: int, labels: Sequence[str], facts: bool) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
-    # A line of decimal numbers, as of the steps of a battery tester, has no names.
+    # A line of decimal numbers, such as a battery tester's line about a step, has no names.
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
         '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
     needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
     if facts:
-        # The names of the columns are one of the facts, the last of the longest.
+        # One of the facts holds the names of the columns: the longest, or the last of equal ones.
         plain = sorted(((k, row) for k, row in ((k, _trimmed(row)) for k, row in plain)
                         if len(row) in (width, len(needed) + 1) and _OF_NAMES.search(row[0])
                         and not any(map(is_value, row))), key=lambda one: len(one[1]))[-1:]
@@ -363,7 +363,7 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     names, units, line = next((found for above in (plain, comments) if (
         found := _names_and_units(above, width, needed))), (
             [f'column {k + 1}' for k in range(width)], [], 0))
-    # A label before the names, as before the numbers of another line, is the name of no column.
+    # A label before the names is not a column's name if another line has one before its numbers.
     some = _trimmed(names)
     labelled = needed and needed == {*range(len(some) - 1)} and _OF_NAMES.search(some[0]) and any(
         list(map(is_value, _trimmed(row))) == [False] + [True] * len(needed)
@@ -400,7 +400,7 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
         count = Counter(names)
         names = [f'{more} {name}'.strip() if k and count[name] > 1 else name or more
                  for k, (name, more) in enumerate(zip(names, over))]
-    # Beside an index at the left, most columns have names; a line of facts leaves more blank.
+    # An index at the left and a few other columns may lack names; a line of facts has few names.
     blank = [k for k in range(1, width) if k in needed and names[k:k + 1] == ['']]
     if blank and (2 * len(blank) >= len(needed - {0}) or any(map(is_value, filter(None, names)))):
         return None
@@ -475,8 +475,8 @@ def numbers(path: Path, form: Form, places: Sequence[int],
             left_out: list[str] | None = None, only: tuple[int, frozenset[str]] | None = None,
             ) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
-    # only: a column, and the words in it whose rows hold numbers; words in others are NaN, and a
-    # number with another unit in the next column is not converted.
+    # only: a column, and the words in it whose rows hold numbers; text in other rows becomes NaN,
+    # and the next column is not read for units.
     # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
     parts: list[list[FloatArray]] = [[] for _ in places]
     with_unit = [place for place in places if not only and has_unit_beside(form.names, place)]
