@@ -488,6 +488,9 @@ class LoadFilter:
 
     def _flown_range(self) -> tuple[float, float]:
         low, high = self._between(0.1)
+        if high - low < _MOVED:
+            # A short climb counts if it determined the sag.
+            low, high = self._between(0.02)
         return self._start.flown if high - low < _MOVED and self._start is not None else (
             low, high)
 

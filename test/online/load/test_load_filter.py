@@ -373,3 +373,15 @@ def test_a_small_sag_of_a_rail_is_known():
         assert load.known
         assert abs(float(load.sag(0.8)) - 0.04) < 3.0 * float(load.sag_se(0.8))
         assert float(load.sag_se(0.8)) < 0.2 * 0.04
+
+
+def test_a_short_climb_keeps_the_sag_known():
+    """A plane at constant throttle: its sag was unknown again, "throttle has not moved"."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 240.0, 0.1)
+    u = np.where(t < 4.0, 0.0, np.where((t > 100.0) & (t < 115.0), 0.9, 0.55))
+    filtered = LoadFilter()
+    filtered.push(t, 8.2 - 0.8 * u ** 1.5 + 0.01 * rng.standard_normal(t.size), u)
+    load = filtered.load()
+    assert load.known
+    assert abs(float(load.sag(0.9)) - 0.8 * 0.9 ** 1.5) < 2.0 * float(load.sag_se(0.9))
