@@ -439,6 +439,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
                            'lead-acid')
         flight, facts, risk_of = _flight(
             flown, full, cells, level if rail == 'bus' else None, horizon, risk)
+        if load and not flight.resistance > 0.0:
+            flight = replace(flight, resistance=float(flight.sag[-1]) / most)
         if not facts.sag.known and 'battery_resistance' not in values:
             raise InputError(f'the sag of {flown.name} is unknown, so a remedy cannot be chosen: '
                              'give --set battery_resistance=OHM, or vary the throttle more')
