@@ -41,7 +41,8 @@ def saved(name: str, path: Path) -> Recording:
     """Save the model of a recording, and return its first minute."""
     file, flight = MODELS[name]
     # A model file is for throttle.
-    recording = replace(read_recording(recorded() / file, flight=flight, end=SECONDS), current=None)
+    recording = replace(
+        read_recording(recorded() / file, flight=flight, end=SECONDS), current=None)
     path.write_text(model_text(discover(recording).record, recording))
     return recording
 
