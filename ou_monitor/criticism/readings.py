@@ -253,7 +253,7 @@ def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[
                           for k in single[:_SINGLES])
         more = '' if single.size <= _SINGLES else f' and {single.size - _SINGLES} more'
         notes.append(f'{counted(single.size, "bad sample")} left out: {where}{more}, {rest}. '
-                     'Single glitches of the sensor or the bus look like this.')
+                     'Glitches of the sensor or the bus, and short dips, look like this.')
     return notes
 
 
