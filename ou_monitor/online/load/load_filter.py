@@ -32,6 +32,10 @@ _LAG = 0.004
 # Random walk of the level, V per sqrt(s) and cell: usually, as in an OU of 4.6 mV and 20 s (from
 # the batch fit), and for a nearly empty pack (chosen on bf_hiro_4s; 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
+# Distance from a faster level that predicts better, V per cell, from which the level walks as
+# fast: with 0.005, a sag that appears when motors are armed was late; with 0.01, a fall still
+# passed for sag (simulated packs that empty in their last 8 to 30 s).
+_BEHIND = 0.0075
 # `FastLevel`: prediction time, s; maximum ratio of mean square errors to use it; memory, s;
 # minimum time compared, s; interval of predictions, s.
 _AHEAD, _PAYS, _COMPARED, _LEAST_COMPARED, _EVERY = 1.0, 0.98, 30.0, 10.0, 0.1
@@ -358,7 +362,9 @@ class LoadFilter:
         P[:, 0] -= P[:, 1] * used
         # In a gap, a pack may recover by more than its random walk: by up to 2 % in a minute.
         self._resize(dt)
-        P[0, 0] += (_WALK * self._cells) ** 2 * dt + (
+        # A fall that the level cannot follow would pass for sag.
+        behind = abs(self._fast.of(float(m[0]), 0.0)[0] - float(m[0])) > _BEHIND * self._cells
+        P[0, 0] += ((_FAST_WALK if behind else _WALK) * self._cells) ** 2 * dt + (
             0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
         a = m[2:]
         # Steady sag at full throttle, V: its mean square, so that a small sag can still grow.
