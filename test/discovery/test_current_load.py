@@ -8,6 +8,7 @@ from ou_monitor import discover, Recording
 from ou_monitor.cli.recorded import model_text
 from ou_monitor.criticism.readings import load_of
 from ou_monitor.errors import InputError
+from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import timing
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
@@ -80,15 +81,15 @@ def test_throttle_stays_the_load_where_current_is_noise_or_unknown():
 
 
 def test_one_step_of_the_current_on_a_rail_is_its_load():
-    """Differences of samples hid a step of six deviations; an unrelated step is no load."""
+    """Differences of samples hid a step over 4 ms; an unrelated step is no load."""
     t = np.arange(20_000) / 1000.0
     rng = np.random.default_rng(2)
     noise = SupplyModel((OU(40.0, 0.125, 5.0), MeasurementNoise(0.004))).simulate(t, rng)
     current = 0.6 + 1.5 * (t > 9.0) + 0.004 * rng.standard_normal(t.size)
     wander = SupplyModel((OU(2.0, 0.028, 0.0),)).simulate(t, rng)
-    nothing = np.full(t.size, np.nan)
-    for v, used in ((noise - 0.055 * current, True), (noise, False),
-                    (noise + wander - 0.055 * current, True), (noise + wander, False),
+    nothing, fall = np.full(t.size, np.nan), 0.055 * lowpass(current, t, 0.004)
+    for v, used in ((noise - fall, True), (noise, False),
+                    (noise + wander - fall, True), (noise + wander, False),
                     (noise - 0.08 * (t > 13.0), False)):
         _, full = load_of(Recording(t, v, nothing, '', current=current), t, v, None, [])
         assert math.isfinite(full) == used
