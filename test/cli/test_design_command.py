@@ -11,6 +11,7 @@ from ou_monitor.cli.commands import quantity
 from ou_monitor.cli.main import main
 from ou_monitor.paper.design import row_of
 from ou_monitor.paper.network import PowerNetwork, rail_at
+from ou_monitor.recordings.read import read_recording
 import pytest
 from scipy import stats
 
@@ -367,6 +368,18 @@ def test_the_throttle_limit_is_the_budget_of_analyze(limit, risk, flight, capsys
         assert least == pytest.approx(100.0 * budget['throttle'])
         # At the other risk it lies beyond.
         assert (budget['throttle'] > supply['budget']['throttle']) == (risk > 0.01)
+
+
+def test_outliers_are_left_out_as_in_analyze(flight, tmp_path, capsys):
+    """Three dips by a loose connector had doubled the risk of `design` only."""
+    read = read_recording(flight)
+    volts = read.voltage.copy()
+    for begin in (700, 1300, 2100):
+        volts[begin:begin + 3] -= 4.0
+    path = write_csv(tmp_path / 'loose.csv', read.t, volts, read.throttle, read.current)
+    found = asked(capsys, '--from', path, '--voltage', 14.9, '--risk', 0.01)
+    supply = answer(capsys, 'analyze', path, '--brownout-voltage', 14.9)['supply']
+    assert supply['dips']['count'] > 3 and found['supply'] == supply
 
 
 def test_the_error_of_the_sag_counts():
