@@ -136,11 +136,11 @@ def mean_now(state: LoadState) -> float:
     return float(state.mean[0] - state.size * (answers @ state.mean[2:-1]))
 
 
-def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Sampling
+def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling: Sampling
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the mean of the lowest voltage of each course, its noise, its error, V; (k,)."""
     peak, dt = courses.peak, sampling.interval
-    span = max(horizon, dt)
+    span = np.maximum(horizon, dt)
     stay = np.clip(courses.dwell, dt, span)
     first = np.minimum(stay, max(2.0 * dt, _RISE * INRUSH_TIME))
     half = 0.5 * (stay - first)
