@@ -46,11 +46,12 @@ class Format(NamedTuple):
 
 
 def is_text(head: bytes) -> bool:
-    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+    mark = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if mark or head[1:2] == b'\0' != head[:1] and head[3:4] == b'\0':
         # "Unicode text" of spreadsheets, whose cells use only the first 256 characters.
-        head = head[2:].replace(b'\0', b'')
+        head = head[2 * mark:].replace(b'\0', b'')
     # Text that is not UTF-8 and damaged cells pass, so that the reader can name their line.
-    return bool(head) and (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and head.count(
+    return bool(head) and (head[0] < 0x80 or b'\n' in head) and head.count(
         b'\0') <= _NULS * len(head) and all(
             byte >= 0x20 or byte in b'\0\t\n\r\f' for byte in head)
 

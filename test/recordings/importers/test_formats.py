@@ -33,6 +33,14 @@ def test_the_first_bytes_decide(tmp_path, name, ending):
     assert import_log(path, Request()).format == name
 
 
+@pytest.mark.parametrize('encoding', ['utf-8', 'cp1252', 'utf-16', 'utf-16-le'])
+def test_text_is_known_whatever_its_first_letter_and_encoding(tmp_path, encoding):
+    path = tmp_path / 'a.dat'
+    path.write_bytes('Übernahme\ntime_s,voltage_v\n0.5,5.0\n0.6,5.1\n'.encode(encoding))
+    (voltage,) = import_log(path, Request()).series
+    assert voltage.values.tolist() == [5.0, 5.1]
+
+
 @pytest.mark.parametrize('content, words', [
     (b'', 'is empty'), (b'\x89MCAP0\r\n' + bytes(20), 'an MCAP bag already'),
     (b'\x7fELF' + bytes(100), 'none of the formats that can be read'),
