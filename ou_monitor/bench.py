@@ -342,15 +342,15 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         Flight that gives level, sag, resistance and noise.
     network : mapping, optional
         Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``. A resistance
-        or voltage that the recording shows is changed to the value given; other components are
-        taken for those of the recorded craft.
+        or voltage that the recording shows is changed to the value given; other values describe
+        the recorded craft.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
         Brown-out level, V; on the bus, if `cells` is given, V per cell (by default 3.3).
     cells : int
-        Cells in series; 0: as in the network or the recording, whose voltage is that of a rail if
-        it fits no pack.  A network with 0 cells is a rail.
+        Cells in series; 0: as in the network or the recording.  A recording whose voltage fits no
+        pack, and a network with 0 cells, are rails.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -415,7 +415,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if not flown.has_throttle and flown.current is not None and (
                 most := float(np.fmax.reduce(np.abs(flown.current), initial=0.0))) > 0.0:
             flown = replace(flown, throttle=np.abs(flown.current) / most)
-            load = f' Throttle is the measured current over its largest, {number(most)} A.'
+            load = f' Throttle is the measured current divided by its maximum, {number(most)} A.'
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells, origin = (values['cells'], 'given') if 'cells' in values else cells_of(flown)
         values['cells'] = cells
@@ -466,7 +466,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
             risk: float) -> tuple[Flight, SupplyFacts, Callable[..., float] | None]:
-    """Return a flight in numbers, its facts, and its final risk as a function (full, level: V)."""
+    """Return flight, facts, and the final risk as a function (parameters full and level in V)."""
     from ou_monitor.analysis.noise import remainder, without_wild
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
@@ -548,7 +548,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
              message: str | None = None, columns: CsvColumns | None = None,
              progress: Progress | None = None) -> Result:
     """
-    Simulate a recording of a supply, exact in distribution at any rate.
+    Simulate a recording of a supply; doc/simulation.md states which terms are exact.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts
 
-# Minimum ratio of the fitted noise between the ends of throttle that is reported as a trend.
+# Minimum ratio of the fitted noise at the ends of the throttle range that is reported as a trend.
 _GROWS = 1.25
 # Minimum share of a recording that its only level must cover to stand for the whole (our choice).
 _WHOLE = 0.9
@@ -105,7 +105,7 @@ def overview(recording: Recording, limit: float | None = None,
 
 
 def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:
-    """Return the ratio of the noise, V, between the ends of throttle, by a weighted fit."""
+    """Return the noise at the highest over the lowest throttle, by a weighted fit (rms in V)."""
     if len(near) < 2 or not min(rms[k] for k in near) > 0.0:
         return 1.0
     u = np.array(THROTTLES)[near]

@@ -79,7 +79,7 @@ def check_ranges(given: Mapping[str, Any]) -> None:
 
 
 def part_of_recording(args: argparse.Namespace) -> tuple[float | None, float | None]:
-    """Return the ends of ``--from`` and ``--to``, s; None where not given."""
+    """Return the times of ``--from`` and ``--to``, s; None where not given."""
     start, end = getattr(args, 'start', None), getattr(args, 'end', None)
     if start is not None and end is not None and not start < end:
         raise InputError(f'--from {start:g} is not before --to {end:g}')

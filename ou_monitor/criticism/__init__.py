@@ -1,1 +1,1 @@
-"""Test a model against a recording: integrity of the samples, fit, innovations, statistics."""
+"""Fit a model to a recording and test it: integrity of the samples, innovations, statistics."""

@@ -92,7 +92,7 @@ class Samples:
                        None if self.codes is None else self.codes[part], self.cell)
 
     def columns(self, term: Term) -> FloatArray:
-        """Return the columns of a term of the mean, cached (causal: shared by shorter parts)."""
+        """Return the columns of a term of the mean, cached; shorter parts share them."""
         source = self.longer or self
         # The columns do not depend on the coefficients of the term.
         unit = term.with_linear([1.0] * len(term.LINEAR))

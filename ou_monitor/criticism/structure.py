@@ -114,8 +114,8 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              own: bool = False) -> FloatArray:
     """Return voltage, level and columns of the mean, whitened by the noise of a model."""
     # own: return the columns of the model's terms, then of `more`.  Otherwise return the columns
-    # of `more`, and subtract the model's terms that are not `MEASURED` from the voltage (and
-    # `offset`, V, in both cases).
+    # of `more`, and subtract the model's terms that are not `MEASURED` from the voltage.  The
+    # offset, V, is always subtracted.
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     columns = columns_of(samples, (*kept, *more), run.segment)
@@ -352,7 +352,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
 
 def slopes_of(samples: Samples, terms: Sequence[Term], events: Events | None, base: GaussianFit,
               free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
-    """Return slopes of scores and of log variances, shape (n, free), and processor time, s."""
+    """Return slopes of `z` and of log variances, shape (n, free), and processor time, s."""
     v, cost = base.variance, 0.0
     means, spreads = np.empty((2, samples.n, len(free)))
     for j, (k, name) in enumerate(free):

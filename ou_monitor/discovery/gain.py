@@ -5,7 +5,7 @@ Blocked cross-validation (Bergmeir & Benitez, Inf. Sci. 191 (2012) 192): each bl
 predicted, one step ahead, with parameters from the other blocks.  One fit to everything is enough:
 for each block, one scoring step removes its contribution, and the mean is fitted again.  Scores
 are log densities; neighbouring scores are correlated, so their error comes from means of blocks.
-Only samples at throttle that the other blocks cover are scored; elsewhere a model extrapolates.
+Only samples at a throttle that the other blocks cover are scored; elsewhere models extrapolate.
 
 Limits: laws of the innovations (jumps, tails, switching) and searched values (frequencies, time
 constants) are not fitted again without the block.  Instead one nat is subtracted for each of their

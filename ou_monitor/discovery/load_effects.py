@@ -30,7 +30,7 @@ _NEAR, _MADE = 0.05, 0.5
 
 def low_dips(samples: Samples, rise: FloatArray, baseline: Sequence[Term],
              extended: Sequence[Term], rng: np.random.Generator) -> LowDips:
-    """Count dips below a low level in the samples and in simulations (rise: `rise_at`, V)."""
+    """Count dips below a low level in the samples and in simulations (rise: hysteresis, V)."""
     level, t = dip_level(samples.logged, rise), samples.t
     begins = dip_begins(samples.logged, level, rise)
     minutes = float(t[-1] - t[0]) / 60.0

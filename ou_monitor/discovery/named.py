@@ -65,7 +65,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     fitter = Fitter(samples, start.cost)
     search = Search(fitter.fit(start.terms, start) or start)
     found = _Result(search.copy(), start, before)
-    # Lines were already subtracted, but slower ones may remain, so `line` causes stay allowed.
+    # Only lines above the Nyquist frequency were subtracted, so `line` causes stay allowed.
     given = [term.NAME for term in exact if term.FAMILY != 'line']
     failure, begun = '', None
     dropped: list[str] = []

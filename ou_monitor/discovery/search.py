@@ -46,7 +46,7 @@ _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# Maximum time of a fit, s, to choose the mean again after each cause.
+# Maximum time of a fit, s, for which the mean is chosen again after each cause.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
 # maximum lines added in one round.
@@ -372,9 +372,9 @@ def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Compos
 
 def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Composite:
     """Return a model with the noise terms that have evidence."""
-    # on_sigma: whether sigma may follow the law of the white noise.  It may not before the
-    # response to throttle is chosen, because noise with memory imitates a response, nor if
-    # simulations leave the recorded range: one-step predictions hardly constrain that.
+    # on_sigma: whether sigma may follow the law of the white noise; False until the response to
+    # throttle is chosen, because noise with memory imitates a response.  Such a fit is rejected if
+    # simulations leave the recorded range, which one-step predictions hardly constrain.
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)

@@ -41,7 +41,7 @@ _PLAIN = ((
     ('line', 'the spectrum has a line'),
     ('order line', 'a line follows throttle'),
     ('skewness', 'prediction errors are skewed'),
-    ('kurtosis', 'prediction errors are too often large or too peaked'),
+    ('kurtosis', 'prediction errors have tails that are too heavy or too light'),
     ('tails', 'there are too many outliers'),
     ('clustering', 'large errors come in clusters'),
     ('variance time', 'the noise changes with time'),
@@ -146,9 +146,9 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
 
 
 def left_out_note(count: int, scored: int) -> str:
-    """Return the note for samples at throttle that other blocks do not cover."""
-    return (f'{count} samples are at throttle that the rest of the recording does not cover, so a '
-            f'model fitted to the rest does not apply. Only the other {scored} are scored.')
+    """Return the note for samples at a throttle that other blocks do not cover."""
+    return (f'{count} samples are at a throttle that the rest of the recording does not cover, so '
+            f'a model fitted to the rest does not apply. Only the other {scored} are scored.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
@@ -170,8 +170,8 @@ def no_relaxation_note(alpha: float, step: float) -> str:
 
 def coupling_found(duration: float) -> str:
     """Return what would confirm an AC coupling that was found."""
-    return (f'An AC coupling was found in {number(duration)} s; its evidence grows as 0.24 nats '
-            'times rate of the rail times duration. A DC-coupled recording would settle it.')
+    return (f'An AC coupling was found in {number(duration)} s; its evidence grows by 0.24 nats '
+            'in each relaxation time of the rail. A DC-coupled recording would settle it.')
 
 
 def remaining_words(left: Sequence[Criticism]) -> str:
@@ -182,8 +182,8 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), uncovered: int = 0,
                   doubts: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the verdict, a sentence each: causes, their gain, whether it is right, refusal."""
-    # why: reason for an unknown gain; uncovered: samples at throttle that other blocks lack.
+    """Return the verdict, a sentence each: causes, gain, whether simulations pass, refusal."""
+    # why: reason for an unknown gain; uncovered: samples at a throttle that other blocks lack.
     if not found.causes:
         return (plain(by_load(_without_causes(found, dropped, uncovered), found.load)),)
     order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
@@ -210,8 +210,8 @@ def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> s
             + f'{left}.' + (
                 f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part.'
                 if dropped else '') + (
-                f' {uncovered} samples are at throttle that the rest of the recording does not '
-                'cover, which alone may explain the rest.' if uncovered else ''))
+                f' {uncovered} samples are at a throttle that the rest of the recording does not '
+                'cover; this alone may explain the deviation.' if uncovered else ''))
 
 
 def _gain(found: Finding, why: str) -> str:

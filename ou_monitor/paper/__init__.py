@@ -1,1 +1,1 @@
-"""The paper: its theory, its network, and every number of it recomputed."""
+"""The paper: theory, every number recomputed; the power network, and `design` with it."""

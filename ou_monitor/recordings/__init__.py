@@ -1,1 +1,1 @@
-"""Read and write recordings: MCAP bags, CSV and logs of autopilots <-> `Recording`."""
+"""Read and write recordings (MCAP bags, CSV, logs of autopilots) and model files."""

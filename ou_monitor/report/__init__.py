@@ -1,1 +1,1 @@
-"""Reports of the commands: one `*_document` for each, written as HTML page or terminal text."""
+"""Reports of the commands: one `*_document` for each, as page or text; and `Result`."""

@@ -1,1 +1,1 @@
-"""Messages, as msg_config/*.yaml describes them -> samples for the monitor."""
+"""Messages, as msg_config/*.yaml describes them -> samples; reading and writing of user files."""

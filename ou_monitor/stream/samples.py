@@ -58,7 +58,7 @@ class SourceClock:
         self._arrived = -math.inf
 
     def take(self, stamps: FloatArray, received: FloatArray, arrived: float) -> None:
-        """Register samples, s; arrived: arrival of the last one on the monotonic clock."""
+        """Register stamps and arrivals of samples, s; arrived: the last on the monotonic clock."""
         newest = int(np.argmax(stamps))
         delay = float(received[newest] - stamps[newest])
         least = float(np.min(received - stamps))

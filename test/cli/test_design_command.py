@@ -230,7 +230,7 @@ def test_a_measured_current_is_the_load(tmp_path, capsys):
     path = write_csv(tmp_path / 'rail.csv', np.arange(amps.size) / 50.0, 5.0 - 0.1 * amps
                      + 0.003 * rng.standard_normal(amps.size), current=amps)
     found = asked(capsys, '--from', path)
-    assert f'current over its largest, {amps.max():.3g} A' in found['measured']
+    assert f'current divided by its maximum, {amps.max():.3g} A' in found['measured']
     assert found['network']['battery_resistance'] == pytest.approx(0.1, rel=0.1)
     assert found['present']['sag'] == pytest.approx(
         0.1 * amps.max() * found['throttle'], rel=0.1)

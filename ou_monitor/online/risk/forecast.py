@@ -187,7 +187,7 @@ class ContradictionRate:
         self._right = self._first + (self._right - self._first) * keep + weight * (1.0 - wrong)
 
 
-# Horizons, s, from which the flight learns; those between are interpolated in ln h.
+# Horizons, s, for which laws are learned; those between are interpolated in ln h.
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_HORIZONS = np.log(HORIZONS)
 # Share in the interpolation below which a horizon is left out, above rounding errors.
@@ -288,7 +288,7 @@ def _shares(horizon: float) -> list[float]:
 
 
 def _shorter_horizons(horizon: float) -> list[float]:
-    """Return a horizon and the shorter ones, down to a fifth, from which the flight learns."""
+    """Return a horizon and the shorter ones of HORIZONS, down to a fifth of it."""
     return [*(one for one in HORIZONS if 0.2 * horizon <= one < horizon), horizon]
 
 
