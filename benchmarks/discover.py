@@ -248,8 +248,9 @@ def recorded_runs(given: argparse.Namespace) -> str:
     for name, run in flights(given.names, EVERY):
         middle = run.t.size // 2
         began = time.process_time()
-        whole = discover(run).as_data()
+        finding = discover(run)
         spent.append(time.process_time() - began)
+        whole = finding.as_data()
         alike = float('nan')
         if not given.whole:
             alike = agreement(*(discover(part_of(run, part)).as_data()
@@ -263,7 +264,7 @@ def recorded_runs(given: argparse.Namespace) -> str:
             ', '.join(one if many == 1 else f'{one} x{many}' for one, many in Counter(
                 cause['name'] for cause in whole['causes']).items()) or '-',
             'explained' if whole['verdict'] == 'explained' else f'{left}'
-            + (', refused' if whole['refused'] else ''),
+            + (', refused' if finding.refused else ''),
             *('-' if extended[key] is None else f'{factor * extended[key]:.{digits}f}'
               for key, factor, digits in (('gain', 1.0, 2), ('errors_shrink', 100.0, 0))),
             ', '.join('-' if one is None else f'{one:.3g}' for one in dips),

@@ -10,7 +10,7 @@ lines stay in the fit; not rejecting proves nothing, so the detectable ratio is 
 
 The tests have the significance level `LEVEL`, like the printed intervals.  Each level is fitted by
 itself here; `discover` fits one model to a whole recording, and uses statistics of its innovations
-(`ou_monitor.criticism.battery`) to decide whether they depend on throttle.
+(`ou_monitor.criticism.score_statistics`) to decide whether they depend on throttle.
 """
 
 from __future__ import annotations

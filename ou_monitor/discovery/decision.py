@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.criticism.battery import is_sign
+from ou_monitor.criticism.score_statistics import is_sign
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.term import Role, Term
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import (
-    covariates_of, criticise, NullBank, simulate_bank, simulate_bank_of)
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.score_statistics import (
+    covariates_of, criticise, NullBank, simulate_bank, simulate_bank_of)
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, standard_errors

@@ -16,10 +16,10 @@ from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import criticise, NullBank
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.score_statistics import criticise, NullBank
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS

@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import (
-    _PRIOR, covariates_of, criticise, family_chance, family_edge, simulate_bank, SIZE)
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.score_statistics import (
+    _PRIOR, covariates_of, criticise, family_chance, family_edge, simulate_bank, SIZE)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 import pytest

@@ -13,11 +13,11 @@ from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.level_result import fit_all, fit_parts
 from ou_monitor.analysis.levels import find_levels, LevelSegment
 from ou_monitor.analysis.noise import remainder
-from ou_monitor.criticism.battery import covariates_of, statistics
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.score_statistics import covariates_of, statistics
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.model.spectral_lines import find_lines, on_grid

@@ -6,11 +6,11 @@ import math
 from golden_runs import flight, table
 import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm
-from ou_monitor.criticism.battery import (
-    covariates_of, criticise, simulate_bank, simulate_bank_of, statistics)
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.score_statistics import (
+    covariates_of, criticise, simulate_bank, simulate_bank_of, statistics)
 from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian
 from ou_monitor.discovery.decision import kinds_to_try
 from ou_monitor.discovery.fitting import Fitter, standard_errors

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.criticism.battery import after_large, large_signs, score, throttle_paths
+from ou_monitor.criticism.score_statistics import after_large, large_signs, score, throttle_paths
 import pytest
 from scipy.stats import kstest
 

@@ -4,7 +4,7 @@ from itertools import combinations
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import Covariates, is_sign, statistics
+from ou_monitor.criticism.score_statistics import Covariates, is_sign, statistics
 import pytest
 from scipy import stats
 
