@@ -626,7 +626,8 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
 
 def _columns(run: Run) -> dict[str, Any]:
     drawn = run.recording
-    return {'time_s': drawn.t, 'voltage_v': drawn.voltage, 'throttle': drawn.throttle}
+    load = 'throttle' if drawn.current is None else 'current_a'
+    return {'time_s': drawn.t, 'voltage_v': drawn.voltage, load: run.load}
 
 
 def _drawn_facts(run: Run) -> SupplyFacts:

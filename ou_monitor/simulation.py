@@ -169,21 +169,29 @@ def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
 
 
 def read_throttle(text: str, start: float | None = None, end: float | None = None,
-                  columns: CsvColumns | None = None) -> RecordedThrottle:
+                  columns: CsvColumns | None = None, full: float = 0.0) -> RecordedThrottle:
     """Return the throttle of a recording from start to end, s after its first sample."""
-    return recorded_throttle(read_recording(text, start=start, end=end, columns=columns), text)
+    return recorded_throttle(read_recording(text, start=start, end=end, columns=columns), text,
+                             full)
 
 
-def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
-    """Return the throttle of a recording (name: for error messages)."""
+def recorded_throttle(recording: Recording, name: str, full: float = 0.0) -> RecordedThrottle:
+    """Return the throttle of a recording, or its current over full, A (name: for errors)."""
+    duration = float(recording.t[-1] - recording.t[0])
+    if full:
+        if recording.current is None or not np.isfinite(recording.current).any():
+            raise InputError(f"--throttle '{name}': the load of this model is a current (1 = "
+                             f'{full:.4g} A), and the recording has none')
+        known = np.isfinite(recording.current)
+        return RecordedThrottle(partial(_held, recording.t[known] - recording.t[0],
+                                        recording.current[known] / full), duration, recording)
     known = np.isfinite(recording.throttle)
     if not known.any():
         raise InputError(f"--throttle '{name}': the recording has no throttle: name its column or "
                          'series with --throttle-column')
     t, u = recording.t[known] - recording.t[0], recording.throttle[known]
     # The reader has refused percent and pulses; calibrated sticks may slightly exceed 0..1.
-    return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)),
-                            float(recording.t[-1] - recording.t[0]), recording)
+    return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)), duration, recording)
 
 
 def _held(t: FloatArray, u: FloatArray, at: FloatArray) -> FloatArray:
@@ -295,7 +303,7 @@ def lacks(model: SupplyModel) -> tuple[str, ...]:
     missing = []
     if not any(term.FAMILY == 'load' for term in model.terms):
         missing.append('no response to throttle (load_sag)')
-    if model.load is None:
+    if not model.charged:
         missing.append('no charge (load)' + ('' if 'drift' in names else ' and no drift')
                        + ': it never discharges')
     return tuple(missing)
@@ -310,10 +318,17 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
         run = RunningSupply(model, rate=rate, seed=seed, charge=charge, resistance=resistance)
         while run.samples < total:
             t = run.times(min(SEGMENT, total - run.samples))
-            throttle = profile(t).astype(np.float32).astype(np.float64)
-            yield Recording(t, run.draw(throttle), throttle, name)
+            load = profile(t).astype(np.float32).astype(np.float64)
+            yield _recording(model, t, run.draw(load), load * (model.full_current or 1.0), name)
     except ValueError as error:
         raise InputError(str(error)) from error
+
+
+def _recording(model: SupplyModel, t: FloatArray, voltage: FloatArray, load: FloatArray,
+               name: str) -> Recording:
+    """Return a recording whose load is the model's: throttle, 0..1, or a current, A."""
+    return Recording(t, voltage, name=name, current=load) if model.full_current else (
+        Recording(t, voltage, load, name))
 
 
 # Maximum rate, Hz (stamps count in ns), and maximum duration, s, of a bag.
@@ -350,9 +365,16 @@ class Run:
     def recording(self) -> Recording:
         """Return the whole recording."""
         pieces = list(self.pieces())
-        t, voltage, throttle = (np.concatenate([getattr(piece, column) for piece in pieces])
-                                for column in ('t', 'voltage', 'throttle'))
-        return Recording(t, voltage, throttle, self.name)
+        t, voltage, load = (np.concatenate([getattr(piece, column) for piece in pieces])
+                            for column in ('t', 'voltage', 'current' if (
+                                self.file.model.full_current) else 'throttle'))
+        return _recording(self.file.model, t, voltage, load, self.name)
+
+    @property
+    def load(self) -> FloatArray:
+        """Return the load of the simulated recording: throttle, 0..1, or current, A."""
+        current = self.recording.current
+        return self.recording.throttle if current is None else current
 
     def as_data(self) -> dict[str, Any]:
         """Return the parameters of the simulation, for JSON."""
@@ -381,7 +403,8 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
     still = throttle is None and model is not None and not (
         file.model.needs_throttle or file.model.load)
     profile, words, flown = (constant(NAN), 'none', None) if still else _throttle_of(
-        usual.throttle if throttle is None else throttle, start, end, columns)
+        usual.throttle if throttle is None else throttle, start, end, columns,
+        file.model.full_current)
     length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
     rate = _positive('--rate', _rate_of(file, usual.rate) if rate is None else rate, 'Hz')
     duration = _positive('--duration', length if duration is None else duration, 's')
@@ -407,15 +430,15 @@ def _rate_of(file: ModelFile, usual: float) -> float:
 
 
 def _throttle_of(throttle: Any, start: float | None, end: float | None,
-                 columns: CsvColumns | None) -> tuple[Profile, str, Recording | None]:
+                 columns: CsvColumns | None, full: float) -> tuple[Profile, str, Recording | None]:
     """Return the profile of a throttle, its name, and the recording that it is from."""
     if isinstance(throttle, Recording):
-        return recorded_throttle(throttle, throttle.name).profile, throttle.name, throttle
+        return recorded_throttle(throttle, throttle.name, full).profile, throttle.name, throttle
     if callable(throttle):
         return throttle, 'given', None
     words = str(throttle)
     if is_recording(words, columns):
-        found = read_throttle(words, start, end, columns)
+        found = read_throttle(words, start, end, columns, full)
         return found.profile, words, found.recording
     if start is not None or end is not None:
         raise InputError('--from and --to take a part of a recorded throttle: give --throttle '

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timezone
 import math
-import sys
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__, bench
@@ -98,13 +97,6 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
     """Return the recording, and the result of a function of `bench`, with progress bars."""
     recording, _ = read_given(args)
     check_size(recording)
-    if getattr(args, 'save_model', None) is not None:
-        from ou_monitor.criticism.integrity import examine
-        from ou_monitor.discovery.finding import unsaved_load
-
-        # Reported before the search, which may take long.
-        if why := unsaved_load(examine(recording).full, recording.has_throttle):
-            print(f'ou-monitor {args.command}: {_unsaved(why)}', file=sys.stderr, flush=True)
     with Progress(label, args.json == output.STDOUT) as progress:
         return recording, function(recording, progress=progress, **given)
 
@@ -133,7 +125,8 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     loads = LoadFilter()
     if recording is not None:
         loads.push(recording.t, recording.voltage, recording.throttle, recording.current)
-    model = replace(finding.model, load=loads.learned())
+    model = replace(finding.model, load=loads.learned(),
+                    full_current=finding.full if finding.load == 'current' else 0.0)
     return as_yaml(ModelFile(model, tuple(
         {name: error for name, error in se.items() if error != math.inf}
         for se in finding.se), provenance))

@@ -8,6 +8,7 @@ parameters, estimated from held-out parts, but not later changes of the craft.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -17,7 +18,7 @@ from ou_monitor.comparison.yardstick import (
     Agreement, band, differences, distance, judge, Measures, SpectrumBand, Traces, Yardstick)
 from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
-from ou_monitor.criticism.readings import current_at, usable, why_no_model
+from ou_monitor.criticism.readings import current_at, on_time, usable, why_no_model
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
@@ -53,7 +54,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         simulator: Simulator = fitted
         notes += _fit_notes(fitted, samples)
     else:
-        _check_throttle(model, samples)
+        samples = _checked_load(model, samples, recording.name, notes)
         simulator = FiledModel(model)
         notes.append('The errors of the parameters in the model file are not simulated: the '
                      'bands include only the noise.')
@@ -175,11 +176,19 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
             'simulated.']
 
 
-def _check_throttle(model: SupplyModel, samples: Readings) -> None:
+def _checked_load(model: SupplyModel, samples: Readings, name: str, notes: list[str]
+                  ) -> Readings:
+    """Return the readings with the load of a model from a file, delays corrected."""
     needs = model.needs_throttle
+    if model.full_current:
+        if needs and samples.current is None:
+            raise InputError(f"the load of the model is a current, and '{name}' has none")
+        return samples if samples.current is None else replace(samples, current=on_time(
+            samples.t, samples.voltage, samples.current, 'current', notes)[0])
     if needs and samples.throttle is None:
         raise InputError(f"the model's term '{needs[0]}' needs throttle, and the recording has "
                          'none')
+    return samples
 
 
 def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simulator: Simulator,

@@ -73,8 +73,11 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     # With the recording, the notes say how much of it the model and the exported part explain.
     if target == 'json':
         data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
-                'load': None if model.load is None else model.load.values()}
+                'load': None if model.load is None else model.load.values(),
+                'full_load_a': model.full_current or None}
         return Export(json.dumps(data, indent=1, allow_nan=False), (), model)
+    if math.isnan(full_current) and model.full_current:
+        full_current = abs(model.full_current)
     n = replace(_numbers(model, throttle), stated=_stated_capacity(recording))
     known = not math.isnan(full_current)
     if known and not 0.0 < full_current < math.inf:
@@ -86,7 +89,8 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     left = SupplyModel((replace(model.ou, sigma=0.0, u0=n.full - (
         n.usual_sag if target == 'gazebo' else 0.0)), *(
         () if math.isinf(n.drain) else (Drift((n.empty - n.full) / n.drain, 0.0),)), *(
-        t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))))
+        t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))),
+        full_current=model.full_current)
     notes = _omitted_terms(model, target, throttle, rate)
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is for a constant load, {n.usual_sag:.3g} V: throttle does not '

@@ -253,7 +253,9 @@ class FiledModel:
         analogue = SupplyModel(tuple(
             term for term in self.model.terms
             if term.NAME not in ('held_samples', Quantization.NAME)))
-        return analogue.simulate(samples.t, rng, samples.throttle)
+        full, current = self.model.full_current, samples.current
+        return analogue.simulate(samples.t, rng, samples.throttle if not full else
+                                 None if current is None else current / full)
 
 
 # Number of parts that are held out in turn.

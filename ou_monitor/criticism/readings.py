@@ -99,13 +99,13 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     # divided by its 99 % quantile.
     moved: list[str] = []
     if u is not None:
-        u, _ = _on_time(t, v, u, 'throttle', moved)
+        u, _ = on_time(t, v, u, 'throttle', moved)
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
         notes += moved
         return u, NAN
     said: list[str] = []
-    current, sign = _on_time(t, v, current, 'current', said)
+    current, sign = on_time(t, v, current, 'current', said)
     full = sign * float(np.quantile(np.abs(current), _FULL))
     some = _part(v)
     gain = _gain(t[some], v[some], current[some]) - (
@@ -129,8 +129,8 @@ def _part(v: FloatArray) -> slice:
     return slice(None, None, -(-v.size // _EXAMINED))
 
 
-def _on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str]
-             ) -> tuple[FloatArray, float]:
+def on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str]
+            ) -> tuple[FloatArray, float]:
     """Return a load with late stamps corrected, and its sign; note the correction."""
     # A voltage cannot precede its load, so the stamps of such a load are late; a voltage that
     # follows late is the cause `load_transient`.

@@ -186,9 +186,8 @@ class Finding:
     @property
     def unsaved(self) -> str:
         """Return why a model file cannot hold the extended model; empty if it can."""
-        if self.model is None:
-            return f"'{self.recording}' was not fitted. {self.sentence}"
-        return unsaved_load(self.full, self.has_throttle)
+        return '' if self.model is not None else (
+            f"'{self.recording}' was not fitted. {self.sentence}")
 
     @property
     def closer(self) -> bool:
@@ -260,11 +259,3 @@ def _units(kind: type[Term]) -> dict[str, str]:
 def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]:
     return {'statistic': c.statistic, 'observed': observed, 'simulated_low': c.low,
             'simulated_high': c.high, 'p_value': chance}
-
-
-def unsaved_load(full: float, has_throttle: bool) -> str:
-    """Return why a model file cannot hold a load (full: current at a load of 1, A, or NaN)."""
-    return '' if math.isnan(full) else (
-        'Its load is the measured current, and a model file is for throttle' + (
-            ' (--current-column none uses throttle as the load)' if has_throttle else
-            ', which was not recorded'))

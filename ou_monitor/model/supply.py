@@ -58,6 +58,9 @@ class SupplyModel:
     load: LoadStart | None = None
     # Date in the model file on which the model was learned; empty: unknown.
     date: str = field(default='', compare=False)
+    # Current at which the load is 1, A, negative where the sensor counts so; 0: the load is
+    # throttle, 0..1.
+    full_current: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the composition."""
@@ -83,6 +86,11 @@ class SupplyModel:
         """Return the names of the terms that change the rail but that the live risk ignores."""
         return tuple(term.NAME for term in self.terms
                      if term.STAGE in (Stage.DRIVE, Stage.STATE, Stage.LEVEL) and not term.LIVE)
+
+    @property
+    def charged(self) -> bool:
+        """Return whether its charge is known: the entry `load` is for throttle."""
+        return self.load is not None and not self.full_current
 
     @property
     def needs_throttle(self) -> tuple[str, ...]:
@@ -144,8 +152,10 @@ class Simulation:
         self.resistance = resistance
         self.discharge: Discharge | None = None
         if charge is not None:
-            if model.load is None:
-                raise ValueError("the model has no entry 'load', which the charge needs")
+            if model.load is None or not model.charged:
+                raise ValueError('the charge needs a model over throttle, but the load of this '
+                                 'one is a current' if model.full_current else
+                                 "the model has no entry 'load', which the charge needs")
             self.discharge = Discharge(model.load, model.ou.u0, charge)
         np.empty(_KEPT)
         self._effects = self._in_order(rng)

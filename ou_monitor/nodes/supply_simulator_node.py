@@ -125,7 +125,7 @@ class SupplySimulatorNode(MonitorNode):
             raise InputError('model_file is needed: ou-monitor discover RECORDING --save-model '
                              'm.yaml makes one')
         self._model = read_model(values['model_file']).model
-        self._needs_throttle = bool(self._model.needs_throttle) or self._model.load is not None
+        self._needs_throttle = bool(self._model.needs_throttle) or self._model.charged
         self._lacks = lacks(self._model)
         self._rate = values['rate']
         self._lost = self._sent = 0
@@ -144,7 +144,9 @@ class SupplySimulatorNode(MonitorNode):
         self.get_logger().info(
             f"{', '.join(term.NAME for term in self._model.terms)} at {self._rate:g} Hz on "
             f'{self.resolve_topic_name(self._voltage.source.topic)}'
-            + ''.join(f'; {one}' for one in self._lacks))
+            + ''.join(f'; {one}' for one in self._lacks)
+            + (f'; its load is a current: throttle 1 means {self._model.full_current:.4g} A'
+               if self._model.full_current else ''))
         self._watch()
         self.every(0.2, self._watch)
         self.every(1.0, self._diagnose)
@@ -164,13 +166,13 @@ class SupplySimulatorNode(MonitorNode):
         values = self.values()
         left = values['capacity_left']
         charge = math.nan if left < 0.0 else left
-        if self._model.load is None and left >= 0.0:
-            raise InputError("capacity_left: the model has no entry 'load', so its charge is "
-                             'unknown')
+        if not self._model.charged and left >= 0.0:
+            raise InputError("capacity_left: the model has no entry 'load' over throttle, so its "
+                             'charge is unknown')
         with self._lock:
             self._run_now = RunningSupply(
                 self._model, rate=self._rate, seed=values['seed'],
-                charge=None if self._model.load is None else charge,
+                charge=charge if self._model.charged else None,
                 resistance=values['scale_resistance'])
             # Stamp of the first sample, s; NaN: set from the clock when that sample is drawn.
             self._begin = math.nan

@@ -2,7 +2,8 @@
 Model files: the terms of a supply as YAML.
 
 `model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the first being `ou`;
-`load:` (optional) holds start values of the load filter; `provenance:` is free text.
+`load:` (optional) holds start values of the load filter; `full_load_a:` (optional) is the current
+at which the load is 1, A, if the load is a current; `provenance:` is free text.
 Written by `discover`, read by `simulate` and by the estimator node.
 """
 
@@ -24,7 +25,7 @@ from ou_monitor.records import plain_data
 from ou_monitor.stream.files import one_line, path_words, read_yaml
 import yaml
 
-_KEYS = ('model', 'load', 'provenance')
+_KEYS = ('model', 'load', 'full_load_a', 'provenance')
 _TERM_KEYS = ('term', 'params', 'se')
 _DAY = re.compile(r'\d{4}-\d\d-\d\d')
 _EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
@@ -64,7 +65,7 @@ def parse_model(data: Any, where: str) -> ModelFile:
         raise InputError(f"{where}: 'provenance' must be a mapping")
     try:
         model = SupplyModel(tuple(term for term, _ in terms), _load(data.get('load')),
-                            _date(provenance.get('date')))
+                            _date(provenance.get('date')), _full(data.get('full_load_a')))
     except ValueError as error:
         raise InputError(f'{where}: {error}') from error
     return ModelFile(model, tuple(se for _, se in terms), provenance)
@@ -74,6 +75,17 @@ def _date(entry: Any) -> str:
     """Return a day, which YAML may have read as a date; empty for free text."""
     text = str(entry)[:10]
     return text if _DAY.fullmatch(text) else ''
+
+
+def _full(entry: Any) -> float:
+    """Return the entry `full_load_a`, A; 0 for null."""
+    value = _numbers(entry)
+    if value is None:
+        return 0.0
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (
+            0.0 < abs(value) < math.inf):
+        raise ValueError(f"'full_load_a' must be a current in A other than 0, got {entry!r}")
+    return float(value)
 
 
 def _load(entry: Any) -> LoadStart | None:
@@ -140,6 +152,8 @@ def as_yaml(file: ModelFile) -> str:
         for term, se in zip(file.model.terms, chain(file.se, repeat({})))]}
     if file.model.load is not None:
         data['load'] = file.model.load.values()
+    if file.model.full_current:
+        data['full_load_a'] = file.model.full_current
     if file.provenance:
         data['provenance'] = dict(file.provenance)
     text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)

@@ -44,9 +44,9 @@ SLICE = 1000
 BLOCK_RATE = 10000.0
 BLOCK = 100
 
-# Period, ns, after which an unchanged throttle is repeated, for late subscribers and bags played
+# Period, ns, after which an unchanged load is repeated, for late subscribers and bags played
 # from the middle.
-THROTTLE_PERIOD_NS = 1_000_000_000
+LOAD_PERIOD_NS = 1_000_000_000
 
 # Largest stamp, ns: half the range of 64-bit stamps, as a margin for shifts.
 _LAST_NS = 2.0**62
@@ -55,10 +55,10 @@ _LAST_NS = 2.0**62
 LAST_HEADER_NS = (2**31) * 1_000_000_000 - 1
 
 Stamps = npt.NDArray[np.int64]
-# Log time (ns), index of the topic, message.  At equal times the throttle (0) comes first, because
-# it holds for the voltage of that time.
+# Log time (ns), index of the topic, message.  At equal times the voltage comes last, because the
+# loads hold for the voltage of that time.
 Timed = tuple[int, int, bytes]
-THROTTLE, VOLTAGE = 0, 1
+LOADS, VOLTAGE = ('throttle', 'current'), 2
 
 
 def write_recording(
@@ -67,7 +67,7 @@ def write_recording(
     start_ns: int = 0, sample_rate: float = BLOCK_RATE,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """
-    Write topics `/voltage` and, if throttle is known, `/throttle`.
+    Write topics `/voltage` and, if they are known, `/throttle` and `/current`.
 
     rec: a recording or its pieces, of which only one is held in memory; start_ns in ns,
     sample_rate in Hz.  Returns the topics with their message types, and notes on changes.  If
@@ -82,9 +82,9 @@ def write_recording(
         raise InputError(f"'{rec.name}' holds no sample: there is nothing to write")
     kind, count, first = TYPES[type], 0, 0
     notes: tuple[str, ...] = ()
-    # Samples of an incomplete block; throttle and period of the last message.
+    # Samples of an incomplete block; value and period of each load's last message.
     rest: tuple[Stamps, FloatArray] = np.empty(0, np.int64), np.empty(0)
-    held, period = math.nan, -1
+    held = dict.fromkeys(LOADS, (math.nan, -1))
     with BagWriter(path) as bag:
         bag.add_topic('voltage', kind, sample_rate=sample_rate if blocks else None)
         for piece in _pieces(rec):
@@ -96,8 +96,7 @@ def write_recording(
             _check_header(kind, piece.name, stamps)
             volts = piece.voltage
             whole = stamps.size
-            known = np.isfinite(piece.throttle)
-            times, values = stamps[known], piece.throttle[known].astype(np.float32)
+            times = stamps
             if blocks:
                 check_steady(piece.name, stamps - first, count, sample_rate)
                 stamps, volts = np.append(rest[0], stamps), np.append(rest[1], volts)
@@ -105,17 +104,22 @@ def write_recording(
                 rest = stamps[whole:], volts[whole:]
             count += piece.n
             streams = [_timed(VOLTAGE, encode(kind, stamps[:whole], volts[:whole]))]
-            if values.size:
-                if '/throttle' not in bag.topics:
-                    bag.add_topic('throttle', FLOAT32)
+            for k, name in enumerate(LOADS):
+                load = getattr(piece, name)
+                known = np.isfinite(load) if load is not None else np.zeros(piece.n, np.bool_)
+                if not known.any():
+                    continue
+                if f'/{name}' not in bag.topics:
+                    bag.add_topic(name, FLOAT32)
+                at, values = times[known], load[known].astype(np.float32)
                 # One sample per period is written even if unchanged.
-                periods = times // THROTTLE_PERIOD_NS
-                sent = (np.diff(values, prepend=np.float32(held)) != 0.0) | (
-                    np.diff(periods, prepend=period) > 0)
-                held, period = float(values[-1]), int(periods[-1])
-                streams.append(_timed(THROTTLE, encode(FLOAT32, times[sent], values[sent])))
+                periods = at // LOAD_PERIOD_NS
+                sent = (np.diff(values, prepend=np.float32(held[name][0])) != 0.0) | (
+                    np.diff(periods, prepend=held[name][1]) > 0)
+                held[name] = float(values[-1]), int(periods[-1])
+                streams.append(_timed(k, encode(FLOAT32, at[sent], values[sent])))
             for t, topic, data in heapq.merge(*streams):
-                bag.write(('/throttle', '/voltage')[topic], t, data)
+                bag.write(f"/{(*LOADS, 'voltage')[topic]}", t, data)
         for t, data in encode(kind, *rest):
             bag.write('/voltage', t, data)
     return bag.topics, notes
@@ -128,7 +132,8 @@ def _pieces(rec: Recording | Iterable[Recording]) -> Iterator[Recording]:
         return
     for first in range(0, rec.n, SLICE):
         part = slice(first, first + SLICE)
-        yield Recording(rec.t[part], rec.voltage[part], rec.throttle[part], rec.name)
+        yield Recording(rec.t[part], rec.voltage[part], rec.throttle[part], rec.name,
+                        current=None if rec.current is None else rec.current[part])
 
 
 def _timed(topic: int, messages: Iterable[tuple[int, bytes]]) -> Iterator[Timed]:

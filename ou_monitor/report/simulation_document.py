@@ -19,8 +19,9 @@ def simulation_document(run: Run, output: str | Path | None = None) -> Document:
     return Document(
         'Simulation', f'{output or run.name}: {said}', [said], [
             lambda: [Figure(voltage_plot(run.recording, NAN)),
-                     Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
-                         run.recording.t, run.recording.throttle, '', 2))],
+                     Figure(Plot(*(('Current', 'time, s', 'A') if run.file.model.full_current else
+                                   ('Throttle', 'time, s', 'throttle')), height=160).line(
+                         run.recording.t, run.load, '', 2))],
             Facts([(term.NAME, ', '.join(f'{name} {_words(value)}' for name, value in
                                          term.values().items())) for term in terms])])
 

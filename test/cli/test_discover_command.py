@@ -109,15 +109,34 @@ def test_bad_recordings_are_one_line(tmp_path, capsys):
     failure(capsys, 'discover', path)
 
 
-def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
-    """Its load is the measured current: reported before the search, whose result is given."""
+def test_a_model_over_current_is_saved_simulated_and_compared(tmp_path, capsys):
+    """A vehicle without throttle: its measured current is the load of all commands."""
     rng = np.random.default_rng(4)
     t = np.arange(3000) / 50.0
     amps = np.repeat(rng.uniform(1.0, 40.0, 60), 50)
-    path = write_csv(tmp_path / 'a.csv', t, 16.0 - 0.03 * amps
-                     + 0.01 * rng.standard_normal(t.size), current=amps)
-    model, data = tmp_path / 'm.yaml', tmp_path / 'a.json'
-    assert main(['discover', str(path), '--save-model', str(model), '--json', str(data)]) == 2
-    out, err = capsys.readouterr()
-    assert 'no model saved: its load is the measured current' in err and str(model) not in out
-    assert not model.exists() and json.loads(data.read_text())['load'] == 'current'
+    volts = 16.0 - 0.03 * amps + 0.01 * rng.standard_normal(t.size)
+    path = write_csv(tmp_path / 'a.csv', t, volts, current=amps)
+    bare = write_csv(tmp_path / 'bare.csv', t, volts)
+    model, data, bag = tmp_path / 'm.yaml', tmp_path / 'a.json', tmp_path / 'b.mcap'
+    assert main(['discover', str(path), '--save-model', str(model)]) == 0
+    assert main(['simulate', '--model', str(model), '--throttle', str(path), '--output',
+                 str(bag)]) == 0
+    drawn = read_recording(bag)
+    np.testing.assert_allclose(drawn.current, amps[:drawn.n], rtol=1e-6)
+    assert not drawn.has_throttle
+    slope = -np.polyfit(drawn.current, drawn.voltage, 1)[0]
+    # Its error is 0.01 V / (11 A sqrt(3000)) = 2e-5 Ohm.
+    assert slope == pytest.approx(0.03, abs=2e-4)
+    for run in (path, bag):
+        assert main(['compare', str(run), '--model', str(model), '--json', str(data),
+                     '--force']) == 0
+        found = json.loads(data.read_text())
+        assert found['verdict'] == 'looks_like_it'
+        assert found['mean_path']['variance_explained'] > 0.98
+    capsys.readouterr()
+    assert main(['simulate', '--model', str(model), '--throttle', '0.5', '--export', 'json']) == 0
+    assert json.loads(capsys.readouterr().out)['full_load_a'] == pytest.approx(amps.max(), rel=0.1)
+    for words in (['compare', bare, '--model', model],
+                  ['simulate', '--model', model, '--throttle', bare, '--output',
+                   tmp_path / 'c.mcap']):
+        assert 'is a current' in failure(capsys, *words)

@@ -1,5 +1,6 @@
 """Model files: round trips, and one line for every error."""
 
+from dataclasses import replace
 import datetime
 import math
 
@@ -45,6 +46,7 @@ def test_a_model_file_reads_back_exactly(tmp_path):
                               {}, {'phase': 0.5}),
                      {'recording': 'flight <ü>: 1', 'commit': 'abc', 'heldout_score': -third,
                       'date': datetime.date(2026, 11, 21), 'n': 5})
+    file = replace(file, model=replace(file.model, full_current=-third))
     path = tmp_path / 'm.yaml'
     path.write_text(as_yaml(file), encoding='utf-8')
     assert read_model(path) == file and read_model(str(path)) == file
@@ -112,6 +114,11 @@ def test_numbers_with_an_exponent_need_no_point(tmp_path):
     for text in ('1e', 'e5', '1e999', '0x1p3', 'nan'):
         assert 'ou.u0' in failure({'model': [{'term': 'ou', 'params': {
             **OU['params'], 'u0': text}}]})
+
+
+@pytest.mark.parametrize('full', [0, 0.0, 'x', True, math.inf, [1.0]])
+def test_the_current_of_a_full_load_is_a_number_other_than_zero(full):
+    assert 'full_load_a' in failure({'model': [OU], 'full_load_a': full})
 
 
 @pytest.mark.parametrize('entry, words', [
