@@ -62,12 +62,12 @@ def discover(args: argparse.Namespace) -> int:
     why = finding.unsaved
     if finding.refused and not (why or args.force):
         why = f'{finding.refused}; --force saves it anyway'
-    output.deliver(args, finding, model=None if why else args.save_model)
-    if args.save_model is not None:
-        # Last, so that a refused model does not stop the other files from being written.
-        if why:
-            raise InputError(_unsaved(why))
+    if args.save_model is not None and not why:
         output.write_text(model_text(finding.record, recording), args.save_model, args.force)
+    output.deliver(args, finding, model=None if why else args.save_model)
+    if args.save_model is not None and why:
+        # Last, so that a refused model does not stop the other files from being written.
+        raise InputError(_unsaved(why))
     return 0
 
 
