@@ -60,6 +60,17 @@ def test_each_failure_is_one_row(odd, tmp_path, one_process):
     assert all(note.isprintable() for note in fleet.notes)
 
 
+def test_a_defect_of_the_reader_costs_one_row(odd, tmp_path, one_process, monkeypatch):
+    def form_of(path, *_, **__):
+        raise KeyError(path.stem)
+
+    monkeypatch.setattr('ou_monitor.recordings.importers.csv_table.form_of', form_of)
+    found = find_recordings([str(odd)])
+    fleet = run_fleet(found, tmp_path / 'out', Options(), lambda: '1', workers=1)
+    errors = {row['recording']: row['error'] for row in fleet.failed}
+    assert "(KeyError: 'flight')" in errors['flight.csv'] and len(errors) == 10
+
+
 def test_very_deep_folders_are_not_searched(odd):
     """Hundreds of levels are not searched, and what lies beside them is."""
     before = len(find_recordings([str(odd)]).sources)

@@ -50,6 +50,8 @@ _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 _DAMAGE = re.compile(rb'[^\t\n\r\f -\xff]')
 # Consecutive rows of numbers that mark the beginning of the data.
 _IN_A_ROW = 8
+# Steps of the time by which it leaps from a row that numbers the columns to the data.
+_LEAP = 10.0
 
 # First characters of a comment line.
 COMMENTS = ('#', '%')
@@ -66,6 +68,8 @@ _OF_PLAIN = re.compile(r'(?:^|,)[-+]?\d+\.(?!\d{3}(?!\d))\d+(?=,|$)', re.MULTILI
 # A number with both marks shows which of them separates thousands.
 _BOTH_MARKS = {'.': r'(?<![\d.,:])\d{1,3}(?:,\d{3})+\.\d+(?![\d.,:])',
                ',': r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+,\d+(?![\d.,:])'}
+# A blank between thousands, as spreadsheets write it, which separates no cells.
+_BLANK = re.compile('(?<=\\d)[\xa0\u2007\u2009\u202f](?=\\d{3}(?!\\d))')
 # A number whose decimal comma is within quotes, and does not separate thousands.
 _QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
 # Lines above the data that state the time between rows, or its inverse.
@@ -74,11 +78,12 @@ _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 _INTERVAL = re.compile(
     r'((?:sampl(?:e|ing)|time)[ _]*(?:interval|period)|sampl(?:e|ing)[ _]*time|'
     r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?[tx]|h_?resolution|'
-    r'sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
+    rf'clock(?=\W*{_NUMBER}[nuµm]?s\b)|sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
     r'["\s]*+(?:[\[(](\w+)[\])])?+'
-    rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?',
+    rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+([a-zµμ]*+)',
     re.IGNORECASE)
-_PREFIX = {'n': 1e-9, 'u': 1e-6, 'µ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'G': 1e9, '': 1.0}
+# A prefix of units, in any letter case except for m and M.
+_PREFIX = {'n': 1e-9, 'u': 1e-6, 'μ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'g': 1e9, '': 1.0}
 # A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
 _RECEIVED = re.compile(r'\[?(\d\d:\d\d:\d\d[.,]\d+)(?:\]| -?>) *')
 # The name that a serial plotter takes before each number: Voltage:12.3
@@ -209,6 +214,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
             for row in rows[skip:first]):
         # The names do not fit the columns: rows have lost or gained cells.
         return None
+    first += _numbering(rows[first:]) if at else 0
     # Battery testers indent the names and rows of an inner table by blank cells.
     indent = next((k for k, name in enumerate(rows[at - 1]) if name), 0) if (
         0 < at <= first) else 0
@@ -316,9 +322,24 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
     return next((k for k in numeric if k > names and not _are_units(rows[k])), first)
 
 
+def _numbering(rows: list[list[str]]) -> int:
+    """Return the lines of a row that numbers the columns below their names; 0: there is none."""
+    # Such a row is 1, 2, 3 ...; below it is a blank line, or a first column that does not go on
+    # from 1: it goes back, or leaps.
+    row = _trimmed(rows[0]) if rows else []
+    if len(row) < 2 or row not in ([f'{k + one}' for k in range(len(row))] for one in (0, 1)):
+        return 0
+    below = [k for k, row in enumerate(rows) if k and any(row)]
+    t = [number_of(rows[k][0])[0] if is_number(rows[k][0]) else math.nan for k in (0, *below)]
+    leap = len(t) > 2 and (t[1] < t[0] or t[1] - t[0] > _LEAP * max(
+        abs(after - before) for before, after in zip(t[1:], t[2:])))
+    return below[0] if below and (below[0] > 1 or leap) else 0
+
+
 def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
     """Return lines with decimal points, comments emptied, and delimiting blanks made single."""
-    lines = ['\n' if line.lstrip().startswith(COMMENTS) else line for line in lines]
+    lines = ['\n' if line.lstrip().startswith(COMMENTS) else
+             line if line.isascii() else _BLANK.sub('', line) for line in lines]
     if lines and _RECEIVED.match(lines[0]):
         lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
             delimiter in (rest := line[found.end():]).strip() or ' ' not in rest.strip())
@@ -459,11 +480,15 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
             return float(cell), name
     for line in lines:
         if found := _INTERVAL.search(line):
-            words, unit, number, prefix, _ = found.groups()
-            value = float(number) * _PREFIX[prefix or '']
+            words, unit, number, word = found.groups()
+            rate = re.search('rate|frequency', words, re.IGNORECASE)
+            prefix = word[:1] if re.match('s|hz|$', word[1:].lower()) else ''
+            value = float(number) * (
+                SCALES[TIME_WORDS[word.casefold()]] if not rate and word.casefold() in TIME_WORDS
+                else _PREFIX.get(prefix if prefix == 'M' else prefix.casefold(), 1.0))
             if unit and unit.lower() in TIME_WORDS:
                 value *= SCALES[TIME_WORDS[unit.lower()]]
-            if re.search('rate|frequency', words, re.IGNORECASE):
+            if rate:
                 value = 1.0 / value if value else math.nan
             if value > 0.0:
                 return value, ' '.join(words.split())

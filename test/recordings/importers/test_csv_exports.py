@@ -383,6 +383,20 @@ FORMS = {
         f'{k}\t{0.01 * k:.4f}\t{V[k]}\t{AMPS[k]}\t0.0')), 1.0, False, True),
     'labjack': (table(['Time\tAIN0\tAIN1'], lambda k: (
         f'{0.05 * k:.3f}\t{V[k]}\t0.01')), 0.05, False, False),
+    # A row that numbers the columns, below it a blank line, or a time that leaps.
+    'aim': (table(['"Time","External Voltage","Motor Current"', '"s","V","A"', '"1","2","3"', ''],
+                  lambda k: f'"{0.05 * k:.3f}","{V[k]}","{AMPS[k]}"'), 0.05, False, True),
+    'numbered_columns': (table(['Time,Voltage,Current', '1,2,3,'], lambda k: (
+        f'{500 + 0.05 * k:.3f},{V[k]},{AMPS[k]},')), 0.05, False, True),
+    # Narrow blanks between thousands.
+    'excel_fr_thousands': (table(['Horodatage;Tension (mV);Intensité (mA)'], lambda k: (
+        f"{clock(k, '%d/%m/%Y %H:%M:%S.%f', 0.1)};{1e3 * V[k]:,.1f};{1e3 * AMPS[k]:,.1f}"
+    ).replace(',', '\u202f').replace('.', ',')), 0.1, False, True),
+    # The time between rows by a prefix in another letter case, and by a clock.
+    'owon': (table(['Sample Rate,10KSa/s', 'Frequency,?', 'index,CH1_Voltage(mV)'],
+                   lambda k: f'{k},{1e3 * V[k]:.2f}'), 1e-4, False, False),
+    'hantek': (table(['#CHANNEL:CH1', '#CLOCK=50.0uS', '#UNITS:V', ''],
+                     lambda k: f'{V[k]:.5f},', '\r\n'), 5e-5, False, False),
     'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
         f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
 }
@@ -432,6 +446,8 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     ('t|U\n0|12\n1|13\n', CsvColumns(delimiter='|'), 1.0, [12, 13]),
     ('t,V1,V2\n0,5,12\n1,5,13\n', CsvColumns(voltage='V2'), 1.0, [12, 13]),
     (' 0  12  0.1\n 1  13  0.2\n', CsvColumns(voltage='column 2'), 1.0, [12, 13]),
+    # Minutes are not milli.
+    ('Sampling interval: 1.5 min\nNo.,U\n0,12\n1,13\n', CsvColumns(), 90.0, [12, 13]),
     # Excel's mm:ss.0 drops the hours.
     ('Time,V\n59:59.0,12\n59:59.5,13\n00:00.0,14\n', CsvColumns(), 0.5, [12, 13, 14]),
 ])
