@@ -76,9 +76,14 @@ def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
     return np.asarray(np.maximum(find_step(v), np.full(u.shape, steady)))
 
 
+def is_below(v: FloatArray, limit: float) -> npt.NDArray[np.bool_]:
+    """Return which readings are below a limit by more than a float32 in a message rounds."""
+    return v < limit - 2.0 ** -23 * abs(limit)
+
+
 def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
     """Return the indices at which dips below a limit begin."""
-    below = v < limit
+    below = is_below(v, limit)
     # Ignore readings within the hysteresis: a dip begins where a reading above is followed by one
     # below.
     decides = np.flatnonzero(below | (v > limit + rise))

@@ -78,9 +78,8 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
 def _fit_doubts(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items = []
     if e.status in _LIMITS and known:
-        items.append(('LEVEL_ALONE', Severity.INFO, (
-            'The relaxation that the whole recording shows is not visible at this level alone.'
-            )))
+        items.append(('LEVEL_ALONE', Severity.INFO, 'The relaxation is visible only where the '
+                      'load is removed, not at this level alone.'))
     elif e.status in _LIMITS:
         items.append((e.status.name, Severity.INFO, e.status.value))
     elif e.status is not Status.OK:

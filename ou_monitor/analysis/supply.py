@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.analysis.noise import (
-    dip_begins, floats, Noise, noise_of, Remainder, remainder, rise_that_ends, THROTTLES,
+    dip_begins, floats, is_below, Noise, noise_of, Remainder, remainder, rise_that_ends, THROTTLES,
     without_wild)
 from ou_monitor.model.ou_fit import known_ou
 from ou_monitor.online.estimator.estimator import SLIDING
@@ -277,7 +277,7 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, rise: Float
     # Each reading stands for the time to the next one, without gaps.
     spacing = np.diff(t)
     usual = float(np.median(spacing)) if spacing.size else 0.0
-    held = np.where(v < limit, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
+    held = np.where(is_below(v, limit), np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
     seconds = np.add.reduceat(held, begins)
     deepest, ends = [], [*begins[1:], v.size]
     for k in np.argsort(np.minimum.reduceat(v, begins), kind='stable')[:_DEEPEST].tolist():

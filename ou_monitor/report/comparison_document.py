@@ -17,8 +17,6 @@ _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale 
             'simulation. Dashed lines: levels below which dips are counted.')
 # Fitted range that stands for a given model.
 _NOTHING = (0.0, 0.0)
-# Count of numbers outside their 95 % bands that only 2 % of good simulations reach (of 12).
-_TOO_MANY = 3
 
 
 def comparison_document(found: Agreement, seen: Overview) -> Document:
@@ -56,12 +54,11 @@ def _answer(found: Agreement) -> list[str]:
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
         rows = _rows(found)
         outside = [name.split(', ')[0] for name, _, _, remark in rows if remark]
-        many = len(outside) >= _TOO_MANY
         if outside:
-            chance = 'more than chance explains' if many else 'chance allows this'
+            chance = 'more than chance explains' if found.in_part else 'chance allows this'
             path.append(f'Outside their own bands ({chance} with {len(rows)} numbers): '
                         f'{listed(outside)}.')
-        return [f"{found.verdict.value}{' only in part' * many}: its {lowest}.", *path]
+        return [f"{found.verdict.value}{' only in part' * found.in_part}: its {lowest}.", *path]
     more = [] if found.farthest == 'lowest' else [f'Its {lowest}.']
     return [f'{found.verdict.value}: {found.words}.', *more]
 
@@ -81,7 +78,8 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
-    worst = [('Largest difference', f'within chance: {found.words}')] * (
+    chance = '' if found.in_part else 'within chance: '
+    worst = [('Largest difference', f'{chance}{found.words}')] * (
         found.verdict is Likeness.LOOKS_LIKE_IT)
     share = f'{number(100.0 * found.explained, 3)} %' if found.explained > 0.0 else 'none'
     return [('Mean path', f'explains {share} of the variance; rms '

@@ -28,6 +28,14 @@ def flight(rng, rising=0.02, seconds=30.0):
     return Recording(t, 16.0 - 1.5 * u ** 1.8 + noise, u)
 
 
+@pytest.mark.parametrize('limit', [9.9, 19.8, 13.2, 14.1, 4.7])
+def test_a_reading_at_the_limit_is_no_dip_in_a_message_either(limit):
+    v = np.tile([limit + 1.0, limit], 200)
+    for volts in (v, v.astype(np.float32)):
+        assert supply_facts(Recording(np.arange(400) / 100.0, volts), limit).dips.count == 0
+    assert supply_facts(Recording(np.arange(400) / 100.0, v - 1e-5), limit).dips.count > 0
+
+
 def test_dips_are_runs():
     v = np.full(2000, 12.0)
     v[500:510] = 9.0

@@ -14,7 +14,7 @@ from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.records import Recording
-from ou_monitor.report.comparison_document import _answer
+from ou_monitor.report.comparison_document import _answer, _path
 import pytest
 
 ALPHA, SIGMA, LEVEL, SAG = 20.0, 0.3, 15.0, 1.5
@@ -299,8 +299,10 @@ def test_numbers_outside_their_bands_are_named_beside_the_verdict():
                   lowest=replace(low, measured=low.high + 1.0))
     said = ' '.join(_answer(far))
     assert 'Outside their own bands' in said and 'lowest voltage' in said.split('Outside')[1]
-    assert 'chance allows this' in said
+    assert 'chance allows this' in said and 'within chance' in far.worst
     many = replace(far, dips=tuple(replace(one, measured=one.high + 1.0) for one in far.dips),
                    mean=replace(far.mean, measured=far.mean.high + 1.0))
+    # No chance is claimed for what chance does not explain.
+    assert 'within chance' not in many.worst + str(_path(many))
     assert 'only in part' in _answer(many)[0] and 'distribution (KS distance)' in {
         row['measure'] for row in found.measures()}
