@@ -8,6 +8,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.noise import dip_begins
+from ou_monitor.criticism.adc import find_step
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import LoadFall, LowDips
 from ou_monitor.model.supply import SupplyModel
@@ -77,9 +78,10 @@ def load_fall(samples: Samples, terms: Sequence[Term]) -> LoadFall:
     mean, ends = _path(samples, responses), (u <= low, u >= high)
     measured, explained = (float(np.median(y[ends[0]]) - np.median(y[ends[1]]))
                            for y in (v, mean))
-    # Readings of one stay at a load are not independent.
+    # Readings of one stay at a load are not independent, and both medians are codes of the ADC.
     stays = [1 + int((end[1:] & ~end[:-1])[1:].sum()) for end in ends]
-    error = float(np.std(v - mean)) * math.sqrt(sum(1.0 / count for count in stays))
+    error = math.hypot(float(np.std(v - mean)) * math.sqrt(sum(1.0 / count for count in stays)),
+                       find_step(v) / math.sqrt(6.0))
     return LoadFall(low, high, measured, explained, error)
 
 
