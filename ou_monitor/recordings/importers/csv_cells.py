@@ -159,9 +159,9 @@ def factor_of(name: str) -> float:
     return 1.0 if found is None else 1.0 / float(found[2]) if found[2] else float(found[4])
 
 
-def first_word(text: str) -> str:
-    """Return the first word of a text in lower case; '' if there is none."""
-    return ''.join(text.lower().split()[:1])
+def unit_word(text: str) -> str:
+    """Return the first word of a unit in lower case, without DC or AC; '' if there is none."""
+    return next((word for word in text.lower().split() if word not in ('dc', 'ac')), '')
 
 
 def shown(text: str) -> str:

@@ -30,8 +30,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.csv_cells import (
-    AMPERE_WORDS, first_word, is_clock, is_missing, is_number, is_value, number_of,
-    OTHER_WORDS, SCALES, shown, TIME_WORDS, unit_of, VOLT_WORDS, WORDS)
+    AMPERE_WORDS, is_clock, is_missing, is_number, is_value, number_of, OTHER_WORDS, SCALES, shown,
+    TIME_WORDS, unit_of, unit_word, VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign, TEXT
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import FloatArray
@@ -458,7 +458,7 @@ def has_unit_beside(names: Sequence[str], place: int) -> bool:
 
 def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
     """Return the unit in the next column, such as Volt DC, if that is named so; '' if mixed."""
-    words = [first_word(row[place + 1]) for row in rows if any(row[place + 1:place + 2])
+    words = [unit_word(row[place + 1]) for row in rows if any(row[place + 1:place + 2])
              ] if has_unit_beside(names, place) else []
     kinds = {WORDS.get(word, word)[-1:] for word in words}
     return words[0] if len(kinds) == 1 and words[0] in WORDS else ''
@@ -493,6 +493,17 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
             if value > 0.0:
                 return value, ' '.join(words.split())
     return math.nan, ''
+
+
+def holds_numbers(form: Form, place: int, clock: bool) -> bool:
+    """Return whether the first cells of a column are numbers (clock: or dates or times)."""
+    cells = [cell for cell in form.cells(place) if not is_missing(cell)]
+    return not cells or any(is_value(cell) if clock else is_number(cell) for cell in cells)
+
+
+def holds_clocks(form: Form, place: int) -> bool:
+    """Return whether the first cell of a column is a date or a time, and no number."""
+    return any(not is_number(cell) and is_clock(cell) for cell in form.cells(place)[:1])
 
 
 def numbers(path: Path, form: Form, places: Sequence[int],
@@ -557,8 +568,9 @@ def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int
 
 def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
     """Return cells, with the unit of their row where it is not that of the column."""
-    return tuple(cell if is_missing(cell) or first_word(unit) in ('', stated)
-                 else f'{cell} {unit.strip()}' for cell, unit in zip(cells, units))
+    return tuple(cell if is_missing(cell) or unit_word(unit) in ('', stated)
+                 else ' '.join([cell, *sorted(unit.split(), key=lambda one: not unit_word(one))])
+                 for cell, unit in zip(cells, units))
 
 
 def _blocks(path: Path, file: TextIO, form: Form, width: int,

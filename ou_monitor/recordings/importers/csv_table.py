@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain, islice
 import math
 from pathlib import Path
 import re
@@ -22,48 +23,28 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
-    AMPERE_WORDS, CHANNEL, clock_times, factor_of, first_word, has_day, is_clock, is_missing,
-    is_number, is_value, number_of, OTHER_WORDS, SCALES, SHARE_WORDS, shown, TIME_WORDS, unit_of,
+    AMPERE_WORDS, CHANNEL, clock_times, factor_of, has_day, is_clock, is_missing, is_number,
+    is_value, number_of, OTHER_WORDS, SHARE_WORDS, shown, TIME_WORDS, unit_of, unit_word,
     VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
-    Form, form_of, has_unit_beside, numbers, THROTTLE, TIME, VOLTAGE)
+    Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
+from ou_monitor.recordings.importers.csv_units import (
+    Column, in_si, PULSE_WORDS, spread, stamps_of, unwrapped)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, RawColumns, Request, Series)
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline import hold, MOST_THROTTLE, WILD
+from ou_monitor.timeline import hold, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'
-# Unit -> ends of the throttle; other ends are written LOW:HIGH.
-THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'ms': (1.0, 2.0)}
-_PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit in THROTTLE_UNITS}
-# Ends of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
-_STICKS = (1024, 10000, 32768)
-# Ends of the stick in the flight logs of DJI, by the names that CsvView and PhantomHelp write.
-_DJI = '364:1684'
 # Maximum columns listed; autopilots log a few hundred.
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
 _BACK = 0.25
-# Maximum step and span of a time, s; an unstated unit is the coarsest one within both.
-_USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
-# Number of the first day of 1970 in Excel and MATLAB; days from there to 2100.
-_OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
-# Values of a counter of 32 bits.
-_COUNTS = 2.0**32
 # Minimum rows before repeated stamps are put down to a coarse clock.
 _FEW_ROWS = 8
-# To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
-# deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
-_LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
-# Change by rounding; standard errors above which a mean change is significant.
-_ROUNDING, _SURE = 1e-6, 4.0
-# A voltage without a unit above this is in mV: no craft's pack has that many volts.
-_MOST_VOLTS = 1000.0
-# Maximum of an unknown throttle up to which it is not taken as percent: levers give up to 5 V.
-_LEAST_PERCENT = 5.5
 
 
 # Quantity -> patterns of the end of a column's name without its unit, the best first; in lower
@@ -84,27 +65,28 @@ _PATTERNS = {
         r'volts|voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
         r'|v_?bus|vfas|cels|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
         r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
-        r'[uv](?:rms|dc|mean|mn)?_?1?',
+        r'[uv](?:rms|dc|mean|mn)?_?1?|[uv]_1_[uv](?:rms|dc|mean|mn)',
         r'volt(?:age)?_?filtered(?:_v)?|rxbt',
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
-        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
+        r'throttle|(?:.*_)?actuator_motors(?:_\d+)?_control_0+',
+        r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|(?:commande_)?ga[sz]|'
         r'acelerador|油门|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
         r'rc_?command_3',
         r'rc_?data_3|rc_?out?(?:_?ch?_?3)?|servo3_raw',
         r'pwm|rc_?out?_?ch?_?1|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal|_pwm)?|'
-        r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
+        r'(?!.*(?:limit|trim|max|min)).*throttle.*', r'accelerator_pedal(?:_pos(?:ition)?)?'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?\d?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
         r'(?:.*_)?(?:bus|input|supply|main|pack|total|bms)_?current|i_?bus|curr',
         r'(?:i(?:rms|dc|mn)?|curr(?:ent)?|amps?|strom|courant|corriente|电流)'
-        r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
+        r'(?:_?(?:avg|average|mean))?(?:_?1)?|i_1_i(?:rms|dc|mn)|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }
 _UNITS = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
-          logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}
+          logs.THROTTLE: {**SHARE_WORDS, **PULSE_WORDS}}
 # Exports with unscaled numbers.  Column that reveals the program ('': any program) -> end of a
 # column's name, in lower case -> factor, unit, and the number that stands for "unknown".
 # Betaflight's blackbox explorer: us, 0.01 V and 0.01 A, as logged from version 4.0 on.  MAVLink:
@@ -118,26 +100,19 @@ _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
              ('voltage_battery', 1e-3, 'mV', 65535.0), ('voltages[0]', 1e-3, 'mV', 65535.0),
              ('vcc', 1e-3, 'mV', 0.0), ('vservo', 1e-3, 'mV', 0.0),
              ('current_battery', 1e-2, '10 mA', -1.0))}}
-_CELLS = re.compile(r'(.*voltages\[)0\]', re.IGNORECASE)
-
-
-class _Column(NamedTuple):
-    """A selected column."""
-
-    place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
-    name: str
-    unit: str  # As stated or given, '' if neither
-    scale: float  # Factor by the maker's definition; 0: by the unit
-    unknown: float = math.nan  # Number that stands for "unknown"
+# Names of the first of several columns: cells of a pack are added, motors of PX4 averaged.
+_FIRST_OF = {
+    logs.VOLTAGE: re.compile(r'(.*voltages\[)0(\])', re.IGNORECASE),
+    logs.THROTTLE: re.compile(r'(.*actuator_motors(?:\.\d+)?[/.]control[.\[]0?)0(\]?)')}
 
 
 class _Table(NamedTuple):
     """The data read from a file, in SI units."""
 
     form: Form
-    time: _Column  # Without a place if rows name their series
+    time: Column  # Without a place if rows name their series
     t: FloatArray
-    found: dict[str, tuple[_Column, FloatArray]]  # By quantity
+    found: dict[str, tuple[Column, FloatArray]]  # By quantity
     named: dict[str, FloatArray]  # Other requested columns, as written
     note: str  # How the file was read; '' if nothing was detected
 
@@ -266,13 +241,16 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for name, place in others.items():
         if place in time.place:
             raise InputError(f"{path}: '{name}' is the time, not a signal")
-    cells = _CELLS.fullmatch(found[logs.VOLTAGE].name) if logs.VOLTAGE in found else None
-    places = [*(one.place[0] for one in found.values()), *others.values(), *(
-        k for k, name in enumerate(form.names) if cells and re.fullmatch(
-            re.escape(cells[1]) + r'[1-9]\]', name))]
+    group = {quantity: _rest_of_group(form, quantity, column, wanted)
+             for quantity, column in found.items()}
+    places = [*(one.place[0] for one in found.values()), *others.values(),
+              *chain.from_iterable(group.values())]
     for place in (*time.place, *places):
-        if form.names.count(form.names[place]) > 1:
-            raise InputError(f"{path}:{form.line}: column '{form.names[place]}' occurs twice")
+        same = [k for k, name in enumerate(form.names) if name == form.names[place]]
+        if len(same) > 1 and not (place in time.place and all(
+                form.cells(k) == form.cells(place) for k in same)):
+            raise InputError(f"{path}:{form.line}: column '{form.names[place]}' occurs twice" + (
+                ', with other times: give --sample-interval' * (place in time.place)))
     if series:
         labels: list[str] = []
         t, (mixed,) = _read(path, raw, clock, [value], left_out, {label: labels}, (
@@ -296,33 +274,54 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
             volts).any() and len(form.names) > 2:
         raise InputError(f"{path}: '{found[logs.VOLTAGE].name}' is 0 or blank in every row, as "
                          'without its sensor: name another column by --voltage-column')
-    t, words = _stamps(path, t, raw, wanted, clock)
+    t, words = stamps_of(path, t, raw, wanted, clock)
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
+    rest = iter(values[len(found) + len(others):])
     for (quantity, column), column_values in zip(found.items(), values):
+        several = [column_values, *islice(rest, len(group[quantity]))]
         if quantity == logs.VOLTAGE:
-            # Add the cells of a pack; absent ones read as unknown.
+            # Absent cells of a pack read as unknown.
             column_values = column_values + sum(np.where(np.isfinite(cell) & (
-                cell != 65535.0), cell, 0.0) for cell in values[len(found) + len(others):])
+                cell != 65535.0), cell, 0.0) for cell in several[1:])
+        elif len(several) > 1:
+            column_values = _mean_of_motors(several)
         column_values = column_values * factor_of(column.name)
-        si, guesses[quantity] = _in_si(quantity, column, column_values, units.get(quantity), volts,
-                                       guesses.get(logs.VOLTAGE, ''))
+        si, guesses[quantity] = in_si(quantity, column, column_values, units.get(quantity), volts,
+                                      guesses.get(logs.VOLTAGE, ''))
+        if quantity == logs.THROTTLE and len(several) > 1:
+            guesses[quantity] += f', mean of {len(several)} motors'
         scaled[quantity] = column, si
     if logs.VOLTAGE in scaled and not series:
         column, si = scaled[logs.VOLTAGE]
         _check_one_series(path, form, t, column.name, si)
-    spread = _spread(t, volts)
-    if not np.array_equal(spread, t, equal_nan=True):
+    even = spread(t, volts)
+    if not np.array_equal(even, t, equal_nan=True):
         guesses[_TIME_NAME] += ', equal stamps spread evenly, a guess: --sample-interval'
     note = _read_note(form, time, found, guesses, wanted)
-    return _Table(form, time, spread, scaled, dict(zip(others, values[len(found):])), note)
+    return _Table(form, time, even, scaled, dict(zip(others, values[len(found):])), note)
+
+
+def _rest_of_group(form: Form, quantity: str, column: Column, wanted: CsvColumns) -> list[int]:
+    """Return the other columns of a group if the column is its first."""
+    first = _FIRST_OF[quantity].fullmatch(column.name) if quantity in _FIRST_OF else None
+    if first is None or quantity == logs.THROTTLE and wanted.throttle is not None:
+        return []
+    others = re.compile(re.escape(first[1]) + '[1-9]' + re.escape(first[2]))
+    return [k for k, name in enumerate(form.names) if others.fullmatch(name)]
+
+
+def _mean_of_motors(values: list[FloatArray]) -> FloatArray:
+    """Return the mean of the motors that run at any time, as of a ULog: a stopped one is 0."""
+    used = np.array([one for one in values if np.isfinite(one).any()] or values[:1])
+    return np.where(np.isfinite(used).any(axis=0), np.nansum(used, axis=0) / len(used), np.nan)
 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
     """Return the error for a missing column."""
-    if not form.line and sum(len(row) != form.width for row in form.rows) > _BACK * len(form.rows):
-        hint, option = ('its lines have different numbers of cells: keep those of one kind in a '
-                        'file of their own'), ''
+    if sum(len(row) != form.width for row in form.rows) > _BACK * len(form.rows):
+        hint, option = ('its lines have different numbers of cells, as messages of several kinds '
+                        'have: keep those of one kind in a file of their own'), ''
     else:
         hint = nearest(name, form.names) if form.line else (
             f'the first line holds numbers; add a header {TIME},{VOLTAGE}[,{THROTTLE}] or give '
@@ -351,7 +350,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
         for name in form.names[:form.width]]
     right = _UNITS[quantity]
     free = [k for k in range(len(plain)) if k not in taken and form.names[k]
-            and _holds_numbers(form, k, quantity == _TIME_NAME) is not text]
+            and holds_numbers(form, k, quantity == _TIME_NAME) is not text]
     for pattern in _PATTERNS[quantity]:
         found = list(dict.fromkeys(
             k for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends)
@@ -371,21 +370,10 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
     return found
 
 
-def _holds_numbers(form: Form, place: int, clock: bool) -> bool:
-    """Return whether the first cells of a column are numbers (clock: or dates or times)."""
-    cells = [cell for cell in form.cells(place) if not is_missing(cell)]
-    return not cells or any(is_value(cell) if clock else is_number(cell) for cell in cells)
-
-
-def _holds_clocks(form: Form, place: int) -> bool:
-    """Return whether the first cell of a column is a date or a time, and no number."""
-    return any(not is_number(cell) and is_clock(cell) for cell in form.cells(place)[:1])
-
-
-def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
+def _time_of(path: Path, form: Form, wanted: CsvColumns) -> Column:
     """Return the column of the time, or that rows are counted."""
     if wanted.sample_interval is not None:
-        return _Column((), '--sample-interval', 's', wanted.sample_interval)
+        return Column((), '--sample-interval', 's', wanted.sample_interval)
     if wanted.time is not None:
         return _unit_column(form, _column_place(path, form, wanted.time, '--time-column'),
                             wanted.time_unit)
@@ -404,16 +392,19 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
             return parts
         cells = form.cells(first)
         if beside and ':' in cells[0] and not has_day(cells[0]):
-            return _Column((beside[0], first),
-                           f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
+            return Column((beside[0], first),
+                          f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
     filled = _nameless_columns(form)
-    if len(filled) > 1 and _rises(form, filled[0]):
-        return _parts_of_second(form, filled[0]) or _unit_column(
-            form, filled[0], wanted.time_unit)
+    # The first column that goes on in every row, else the first if it never goes back.
+    rising = [k for k in filled[:len(filled) - 1] if len(form.rows) >= _FEW_ROWS and (
+        np.diff(_times(form, k)) > 0.0).all()] or [k for k in filled[:1] if _rises(form, k)]
+    if len(filled) > 1 and rising:
+        return _parts_of_second(form, rising[0]) or _unit_column(
+            form, rising[0], wanted.time_unit)
     if not math.isfinite(form.step):
         raise InputError(_absent(path, form, TIME, ' (--time-column or --sample-interval)'))
-    return _Column((), form.stated, 's', form.step)
+    return Column((), form.stated, 's', form.step)
 
 
 def _finest(form: Form, first: int) -> int:
@@ -421,7 +412,7 @@ def _finest(form: Form, first: int) -> int:
     named = [k for k in range(min(form.width, len(form.names)))
              if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
              and not re.search(
-                 'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
+                 'step|lap|interval', form.names[k].lower()) and holds_numbers(form, k, True)]
     # A time with decimals and a unit is finer than a clock of whole seconds.
     whole = all(re.search(r':\d\d:\d\d$', cell) for cell in form.cells(first))
     finer = [k for k in named if whole and form.units[k] in TIME_WORDS and any(
@@ -434,7 +425,7 @@ def _finest(form: Form, first: int) -> int:
         2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)), first)
 
 
-def _parts_of_second(form: Form, clock: int) -> _Column | None:
+def _parts_of_second(form: Form, clock: int) -> Column | None:
     """Return a time in whole seconds with the column of ms or ns beside it, if there is one."""
     cells = form.cells(clock)
     if all(map(str.isdigit, cells)):
@@ -445,7 +436,7 @@ def _parts_of_second(form: Form, clock: int) -> _Column | None:
     else:
         return None
     most = 3 if unit == 'ms' else 9
-    return next((_Column((clock, k), f'{form.names[clock]}, {form.names[k]}', unit, 0.0)
+    return next((Column((clock, k), f'{form.names[clock]}, {form.names[k]}', unit, 0.0)
                  for k, name in enumerate(form.names[:form.width])
                  if k != clock and (k in rest or re.fullmatch(pattern, name.strip().lower()))
                  and all(k < len(row) and re.fullmatch(rf'0?\.\d+|\d{{1,{most}}}', row[k])
@@ -487,7 +478,7 @@ def _rises(form: Form, place: int) -> bool:
     return not (np.diff(_times(form, place)) < 0.0).any()
 
 
-def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
+def _unit_column(form: Form, place: int, unit: str | None) -> Column:
     name, stated = form.names[place], form.units[place]
     end = re.split('[./:]', name.strip().lower())[-1]
     raw = next((units[end] for column, units in _RAW.items()
@@ -495,8 +486,8 @@ def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
     if raw and raw[1].startswith(unit or '') and not (stated and unit is None):
         if end == 'vbatlatest' and re.search(r'Betaflight 3\.[1-9]|Cleanflight [2-9]', form.above):
             raw = 0.1, '0.1 V', math.nan
-        return _Column((place,), name, raw[1], raw[0], raw[2])
-    return _Column((place,), name, unit or stated, 0.0)
+        return Column((place,), name, raw[1], raw[0], raw[2])
+    return Column((place,), name, unit or stated, 0.0)
 
 
 def _stem(name: str) -> str:
@@ -505,8 +496,8 @@ def _stem(name: str) -> str:
         name)[0].lower())
 
 
-def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed: bool,
-               ) -> dict[str, _Column]:
+def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: Column, needed: bool,
+               ) -> dict[str, Column]:
     """Return the columns of voltage, throttle and current that exist."""
     names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
              logs.THROTTLE: (wanted.throttle, '--throttle-column', wanted.throttle_unit),
@@ -515,7 +506,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
         wanted.time, *(name for name, *_ in names.values())) if name in form.names]
     taken = [*time.place, *given]
     currents = {_stem(form.names[k]) for k in _choose(form, logs.CURRENT, taken)}
-    found: dict[str, _Column] = {}
+    found: dict[str, Column] = {}
     for quantity, (name, option, unit) in names.items():
         if name == NONE and quantity != logs.VOLTAGE:
             continue
@@ -553,11 +544,17 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             raise InputError(f"{path}: '{name}' has {kind}: name a column of "
                              f'{quantity}{more.get(quantity, "")}')
     if needed and logs.VOLTAGE not in found:
+        # Lines of a logic analyser hold the digits 0 and 1.
+        rest = [k for k in range(form.width) if k not in taken and holds_numbers(form, k, False)
+                and not {*''.join(form.cells(k))} <= {'0', '1'}]
+        if form.line and not rest and not _choose(form, logs.VOLTAGE, text=True):
+            raise InputError(f'{path} holds no voltage, only '
+                             f'{some(list(filter(None, form.names)), 9)}')
         raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column)'))
     return found
 
 
-def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
+def _series_of(path: Path, form: Form, wanted: CsvColumns, time: Column,
                ) -> tuple[Form, int, int] | None:
     """Return the form of the series that rows name, and the columns of their names and values."""
     named = _choose(form, logs.VOLTAGE, time.place)
@@ -565,15 +562,15 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
             named if wanted.voltage is None else wanted.voltage in form.names):
         return None
     places = [k for k in range(min(form.width, len(form.names))) if k not in time.place]
-    value = [k for k in places if _holds_numbers(form, k, False) and re.fullmatch(
+    value = [k for k in places if holds_numbers(form, k, False) and re.fullmatch(
         rf'(?=.)(?:{_VALUE_NAME}|state)', form.names[k].lower())] or named
-    for place in (k for k in places if value and not _holds_numbers(form, k, True)):
+    for place in (k for k in places if value and not holds_numbers(form, k, True)):
         labels: list[str] = []
         stated: list[str] = []
         beside = has_unit_beside(form.names, value[0]) and value[0] + 1 != place
         numbers(path, form, [], {place: labels} | ({value[0] + 1: stated} if beside else {}), [])
         names = tuple(sorted({*labels} - {''}))
-        own = {name: first_word(unit) for name, unit in zip(labels, stated)}
+        own = {name: unit_word(unit) for name, unit in zip(labels, stated)}
         series = form._replace(names=names, width=len(names), rows=(), units=tuple(
             unit_of(name)[1] or (word if (word := own.get(name, '')) in WORDS else '')
             or unit_of(form.names[value[0]])[1] for name in names))
@@ -583,7 +580,7 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
     return None
 
 
-def _read(path: Path, form: Form, time: _Column, places: list[int],
+def _read(path: Path, form: Form, time: Column, places: list[int],
           left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
           only: tuple[int, frozenset[str]] | None = None) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
@@ -593,7 +590,7 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
                              f'within {LEAST_STEP:g} to {LONGEST_STEP:g} s')
         values = numbers(path, form, places or [0], left_out=left_out)
         return time.scale * np.arange(float(values[0].size)), values
-    if _holds_clocks(form, time.place[0]):
+    if holds_clocks(form, time.place[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
                          left_out, only)
@@ -606,18 +603,7 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
-    return _unwrapped(t) * factor_of(time.name), values
-
-
-def _unwrapped(t: FloatArray) -> FloatArray:
-    """Unwrap a 32-bit counter of a time; micros() wraps after 72 minutes."""
-    known = np.isfinite(t)
-    if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all():
-        on = np.unwrap(t[known], period=_COUNTS)
-        # A restart of the logger is not a wrap: unwrapped, it would leave an unusually long step.
-        if (np.diff(on) <= 2.0 * np.diff(t[known]).max(initial=0.0)).all():
-            t[known] = on
-    return t
+    return unwrapped(t) * factor_of(time.name), values
 
 
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
@@ -656,138 +642,7 @@ def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
     return cells if len(cells) == size else []
 
 
-def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Column,
-            ) -> tuple[FloatArray, str]:
-    """Return the time in s, and its unit in words."""
-    if not time.place:
-        return t, f'{time.scale:g} s'
-    if _holds_clocks(form, time.place[0]):
-        return t, 'dates and times'
-    known = t[np.isfinite(t)]
-    steps = np.abs(np.diff(known))
-    usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
-    if len(time.place) > 1:
-        unit, words = 's', ''
-    elif time.unit:
-        unit, words = time.unit if wanted.time_unit else TIME_WORDS[time.unit], ''
-    else:
-        # Clocks that count from 1970 show their unit by their size.
-        size = float(np.median(np.abs(known))) if known.size else 0.0
-        span = float(np.ptp(known)) if known.size else 0.0
-        unit = clock_unit(size)
-        if not unit or usual * TIME_UNITS[unit] > LONGEST_STEP:
-            unit = next((name for name, scale in TIME_UNITS.items() if (
-                usual * scale <= _USUAL_STEP and span * scale <= _USUAL_SPAN)), 's')
-        first = next((day for day in _OF_1970 if 0.0 < size - day < _TO_2100), 0.0)
-        if unit == 's' and first and 0.0 < usual < 1e-4:
-            unit, t = 'd', t - first
-        words = '' if unit == 's' else ', a guess: --time-unit'
-    t = t * SCALES[unit]
-    # A unit of minutes or more is no mistake for a finer one; a unit from the user is accepted.
-    if usual * SCALES[unit] > LONGEST_STEP and SCALES[unit] <= 1.0 and not wanted.time_unit:
-        raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
-                         f"'{time.name}': is it in ms, us or ns? Give --time-unit")
-    return t, unit + words
-
-
-def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
-    """Spread rows with equal stamps evenly, if their number per stamp is steady."""
-    # The first row of a stamp is at the stamp, unless rows are missing before it.
-    known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
-    stamps, change = t[known], np.diff(volts[known])
-    begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
-    step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
-    if step.size and (step < 0.0).all():
-        return _spread(t[::-1], volts[::-1])[::-1]
-    if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
-        return t
-    usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Leave the stamps if the voltage changes only where the stamp does (repeated rows), or always
-    # in one direction where it does (several series in turn).
-    if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
-            first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
-                np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
-                    1.0, _SURE / math.sqrt(first.size)):
-        return t
-    row, even = np.arange(float(known.size)), stamps.copy()
-    pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
-    for part in np.split(begin, pauses):
-        end = begin[begin > part[-1]].min(initial=known.size)
-        # The first and the last stamp may lack rows.
-        x = np.unique(np.append(part[1::_EVEN], part[-1]))
-        rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
-        here = row[part[0]:end]
-        even[part[0]:end] = np.interp(here, x, stamps[x]) + rate * (
-            np.minimum(here - x[0], 0.0) + np.maximum(here - x[-1], 0.0))
-    return t if (np.diff(even) <= 0.0).any() else np.where(
-        np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
-
-
-def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None,
-           volts: FloatArray, beside: str) -> tuple[FloatArray, str]:
-    """Return values in V, 0..1 or A, and their unit in words (beside: the voltage's unit)."""
-    known = np.abs(values[np.isfinite(values)])
-    if quantity == logs.THROTTLE:
-        unit = given or SHARE_WORDS.get(column.unit) or _PULSE_WORDS.get(column.unit)
-        guess = unit is None
-        if guess and column.name.lower() == 'rc.throttle' and known.size and known.max() > 100.0:
-            unit = _DJI
-        unit = unit or _throttle_unit(values[np.isfinite(values)], volts)
-        # Percentages below 0 are of a stick, except a duty, which is of a motor in reverse.
-        if given is None and unit == '%' and np.mean(values < -MOST_THROTTLE) > WILD and not (
-                re.search('duty|pwm', column.name.lower())):
-            guess, unit = True, '-100:100'
-        words = ', a guess: --throttle-unit' if guess and unit != '1' else ''
-        if unit in ('us', 'ms'):
-            # 0: an output without pulses.
-            values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
-        low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
-        return (values - low) / (high - low), (
-            '0..1' if unit == '1' else unit) + words
-    # Use the maker's factor, unless it makes a supply of less than 1 V: then the numbers were
-    # converted already, under the same names.
-    if column.scale and 'V' not in (given, beside) and (
-            math.isnan(column.unknown) or (known == np.rint(known)).all()) and (
-            quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
-        return np.where(values == column.unknown, np.nan, values * column.scale), column.unit
-    if quantity == logs.CURRENT:
-        small = not column.unit and beside.startswith('mV,') and bool(
-            (known == np.rint(known)).all())
-        unit = 'mA' if small else AMPERE_WORDS.get(column.unit, 'A')
-        return values * SCALES[unit], unit + ', a guess' * small
-    unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
-    if not unit:
-        unit, words = ('mV', ', a guess: --unit') if known.size and np.median(
-            known) > _MOST_VOLTS else ('V', '')
-    return values * SCALES[unit], unit + words
-
-
-def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
-    """Return the unit suggested by the sizes of a throttle; '1' by default."""
-    known = np.abs(values)
-    if not known.size:
-        return '1'
-    low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
-    if low >= 0.8 and 1.1 < high <= 2.2:
-        # Pulses in ms.
-        return '1:2'
-    beyond = known[known > MOST_THROTTLE]
-    # With a voltage within 0 to 1 it may be the voltage: `check_throttle` reports it.
-    if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
-        return '1'
-    if high <= 110.0:
-        return '%' if high > _LEAST_PERCENT else '1'
-    negative = float(np.mean(values < -MOST_THROTTLE)) > WILD
-    if np.quantile(known[known > 0.0], WILD) >= 800.0 and high <= 2200.0 and not negative:
-        return 'us'
-    if negative:
-        return next((f'{-end}:{end}' for end in _STICKS if high <= end), '1')
-    # The thrust of a Crazyflie; other counts end at 10 000 at most.
-    return '0:65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (
-        high > 32768.0 or (values == np.rint(values)).all()) else '1'
-
-
-def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str],
+def _read_note(form: Form, time: Column, found: dict[str, Column], units: dict[str, str],
                wanted: CsvColumns) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     encoding = '' if form.encoding in ('utf-8', 'utf-8-sig') else f', {form.encoding}'
@@ -818,7 +673,7 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
             name for k, name in enumerate(form.names[:form.width])
             if k not in used and name not in others
             and not any(re.fullmatch(one, plain[k] or ' ') for one in _PATTERNS[_TIME_NAME])
-            and form.units[k] not in TIME_WORDS.keys() - _PULSE_WORDS.keys()
+            and form.units[k] not in TIME_WORDS.keys() - PULSE_WORDS.keys()
             and (logs.THROTTLE in lacking or re.search('curr|amps|strom|cour', name.lower()))
             and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
             and (not form.rows or any(

@@ -137,9 +137,8 @@ def detect(path: Path) -> Format:
                      'read: ' + '; '.join(one.words for one in FORMATS if one.module))
 
 
-# Endings of text tables; their first bytes must not fit another format.
-_TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log', '.lvm', '.msl', '.prn',
-           '.xls')
+# Endings of bags and their metadata; text with any other is read as a table.
+_OF_BAGS = ('.mcap', '.db3', '.bag', '.yaml', '.yml')
 
 
 def kind_of(path: Path) -> str:
@@ -150,7 +149,7 @@ def kind_of(path: Path) -> str:
         found = detect(path) if path.is_file() else None
     if found is None:
         return CSV if ending == '.csv' and not path.is_dir() else BAG
-    return found.name if found.name != CSV or ending in _TABLES else BAG
+    return BAG if found.name == CSV and ending in _OF_BAGS else found.name
 
 
 def import_log(path: Path, request: Request) -> Log:

@@ -397,6 +397,32 @@ FORMS = {
                    lambda k: f'{k},{1e3 * V[k]:.2f}'), 1e-4, False, False),
     'hantek': (table(['#CHANNEL:CH1', '#CLOCK=50.0uS', '#UNITS:V', ''],
                      lambda k: f'{V[k]:.5f},', '\r\n'), 5e-5, False, False),
+    # Numbers HHMMSS.ss over a full minute.
+    'racelogic': (table(['sats,time,velocity kmh,Battery_Voltage,Battery_Current'], lambda k: (
+        f"012,{clock(k, '%H%M%S.00', 1.0)},41.0,{V[k]},{AMPS[k]}")), 1.0, False, True),
+    # The unit of a row behind DC.
+    'extech': (table(['Place\tDate\tTime\tCh1_Value\tCh1_Unit\tCh2_Value\tCh2_Unit\t'],
+                     lambda k: f"{k}\t{clock(k, '%Y/%m/%d%t%H:%M:%S', 1.0)}\t{V[k]}\tDC V\t"
+                               f'{AMPS[k]}\tDC A\t'), 1.0, False, True),
+    # Each motor of PX4, the mean of which comes before the stick; the second stands still first.
+    'plotjuggler_motors': (table(
+        ['__time,battery_status/voltage_v,manual_control_setpoint/throttle,'
+         'actuator_motors.00/control.00,actuator_motors.00/control.01'],
+        lambda k: f'{0.01 * k:.2f},{V[k]},0.9,{2 * U[k] if k < 9 else U[k] - 0.05},'
+                  f"{'nan' if k < 9 else U[k] + 0.05}"), 0.01, True, False),
+    # The same times before each channel.
+    'labview_multi': (table(['X_Value\tVoltage\tX_Value\tCurrent\tComment'], lambda k: (
+        f'{0.01 * k:.2f}\t{V[k]}\t{0.01 * k:.2f}\t{AMPS[k]}')), 0.01, False, True),
+    'junsi': (table([], lambda k: f'$1;2;{1000 * k};12315;{1e3 * V[k]:.0f};-49;0'), 1.0, False,
+              False),
+    'excel_fr_gaz': (table(['Temps (s);Tension batterie (V);Commande gaz (%)'], lambda k: (
+        f'{0.01 * k:.2f};{V[k]};{100 * U[k]:.1f}'.replace('.', ','))), 0.01, True, False),
+    'scan_my_tesla': (table(['Time,Battery voltage,Accelerator Pedal'], lambda k: (
+        f'{10 * k},{V[k]},{100 * U[k]:.1f}')), 0.01, True, False),
+    'yokogawa_wt': (table(
+        ['"Model Name","WT1800"', '', 'Store No.,Date,Time,Millisecond,U-1-Udc,I-1-Idc,P-1'],
+        lambda k: f"{k},{clock(k, '%Y/%m/%d,%H:%M:%S', 0.1)},{100 * k % 1000},{V[k]},{AMPS[k]},1"),
+        0.1, False, True),
     'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
         f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
 }
@@ -448,6 +474,8 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     (' 0  12  0.1\n 1  13  0.2\n', CsvColumns(voltage='column 2'), 1.0, [12, 13]),
     # Minutes are not milli.
     ('Sampling interval: 1.5 min\nNo.,U\n0,12\n1,13\n', CsvColumns(), 90.0, [12, 13]),
+    # HHMMSS over midnight.
+    ('time,U\n235958,12\n235959,13\n0,14\n1,13\n', CsvColumns(), 1.0, [12, 13, 14, 13]),
     # Excel's mm:ss.0 drops the hours.
     ('Time,V\n59:59.0,12\n59:59.5,13\n00:00.0,14\n', CsvColumns(), 0.5, [12, 13, 14]),
 ])
@@ -791,10 +819,24 @@ def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
 
 @pytest.mark.parametrize('header, row, words', [
     ('Time (s),Vfas,A1', lambda k: f'{0.1 * k:.1f},0.0,{V[k]}', "'Vfas' is 0 or blank"),
-    ('Time(s),D0,A0,A1', lambda k: f'{0.1 * k:.1f},1,{k % 2},0', "no column 'voltage_v'")])
+    ('Time(s),D0,A0,A1', lambda k: f'{0.1 * k:.1f},1,{k % 2},0', 'no voltage, only Time.s., D0'),
+    ('Timestamp(ms),Current(uA),D0-D7', lambda k: f'{k},{U[k]},00000000', 'no voltage, only'),
+    ('X_Value,Voltage,X_Value', lambda k: f'{k},{V[k]},{2 * k}', 'twice, .* --sample-interval'),
+    ('', lambda k: f'{clock(k)},FE,attitude_t,roll,{k},pitch,2,yaw,3\n'
+                   f'{clock(k)},1,sys_status_t,load,333,voltage_battery,16000',
+     'messages of several kinds')])
 def test_dead_sensors_and_logic_lines_are_no_voltage(header, row, words, tmp_path):
     with pytest.raises(InputError, match=words):
         read_recording(written(tmp_path, table([header], row)))
+
+
+@pytest.mark.parametrize('unit, asked', [('ms', True), ('s', False)])
+def test_a_step_far_below_its_unit_is_questioned(unit, asked, tmp_path):
+    """Monsoon names ms, and writes s."""
+    path = written(tmp_path, table([f'Time({unit}),Voltage'], lambda k: f'{2e-4 * k:.6f},{V[k]}'))
+    assert ('2e-07 s from row to row: --time-unit s' in ' '.join(read_recording(path).notes)
+            ) == asked
+    assert read_recording(path, columns=CsvColumns(time_unit='s')).t[1] == 2e-4
 
 
 def test_hours_between_samples_are_believed(tmp_path):

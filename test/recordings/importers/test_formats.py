@@ -6,7 +6,8 @@ import sys
 from made_logs import blackbox, copter, crazyflie, hover, px4_flight, quad, ulog
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
-from ou_monitor.recordings.importers.formats import BAG, detect, FORMATS, import_log
+from ou_monitor.recordings.importers.formats import (
+    BAG, detect, FORMATS, import_log, kind_of)
 from ou_monitor.recordings.importers.log import Request
 from packaging.requirements import Requirement
 from project import metadata, ROOT
@@ -70,6 +71,13 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
         detect(tmp_path / 'none.ulg')
     with pytest.raises(InputError, match='is a folder'):
         detect(tmp_path)
+
+
+@pytest.mark.parametrize('ending, kind', [
+    ('.mpt', 'csv'), ('.DTA', 'csv'), ('', 'csv'), ('.mcap', 'mcap'), ('.yaml', 'mcap')])
+def test_text_is_a_table_unless_its_name_is_of_a_bag(tmp_path, ending, kind):
+    (tmp_path / f'a{ending}').write_bytes(CSV)
+    assert kind_of(tmp_path / f'a{ending}') == kind
 
 
 def test_missing_flight_is_refused(tmp_path):

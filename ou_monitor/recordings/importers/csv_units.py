@@ -1,0 +1,222 @@
+"""
+Convert columns of a table of text to SI: stamps in s, voltage in V, throttle 0..1, current in A.
+
+A stated or given unit is used; otherwise the unit is guessed from the sizes of the values, and the
+words about it say so.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+import re
+from typing import NamedTuple
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers import log as logs
+from ou_monitor.recordings.importers.csv_cells import (
+    AMPERE_WORDS, SCALES, SHARE_WORDS, TIME_WORDS, VOLT_WORDS)
+from ou_monitor.recordings.importers.csv_form import Form, holds_clocks
+from ou_monitor.recordings.importers.log import CsvColumns
+from ou_monitor.records import clock_unit, FloatArray, LONGEST_STEP, TIME_UNITS
+from ou_monitor.timeline import MOST_THROTTLE, WILD
+
+# Unit -> ends of the throttle; other ends are written LOW:HIGH.
+THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'ms': (1.0, 2.0)}
+PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit in THROTTLE_UNITS}
+# Ends of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
+_STICKS = (1024, 10000, 32768)
+# Ends of the stick in the flight logs of DJI, by the names that CsvView and PhantomHelp write.
+_DJI = '364:1684'
+# Maximum step and span of a time, s; an unstated unit is the coarsest one within both.
+_USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
+# Number of the first day of 1970 in Excel and MATLAB; days from there to 2100.
+_OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
+# Values of a counter of 32 bits; seconds of a day.
+_COUNTS, _DAY = 2.0**32, 86400.0
+# To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
+# deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
+_LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
+# Change by rounding; standard errors above which a mean change is significant.
+_ROUNDING, _SURE = 1e-6, 4.0
+# A voltage without a unit above this is in mV: no craft's pack has that many volts.
+_MOST_VOLTS = 1000.0
+# Maximum of an unknown throttle up to which it is not taken as percent: levers give up to 5 V.
+_LEAST_PERCENT = 5.5
+
+
+class Column(NamedTuple):
+    """A selected column."""
+
+    place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
+    name: str
+    unit: str  # As stated or given, '' if neither
+    scale: float  # Factor by the maker's definition; 0: by the unit
+    unknown: float = math.nan  # Number that stands for "unknown"
+
+
+def unwrapped(t: FloatArray) -> FloatArray:
+    """Unwrap a 32-bit counter of a time; micros() wraps after 72 minutes."""
+    known = np.isfinite(t)
+    if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all():
+        on = np.unwrap(t[known], period=_COUNTS)
+        # A restart of the logger is not a wrap: unwrapped, it would leave an unusually long step.
+        if (np.diff(on) <= 2.0 * np.diff(t[known]).max(initial=0.0)).all():
+            t[known] = on
+    return t
+
+
+def _of_day(t: FloatArray) -> FloatArray | None:
+    """Return times written as the numbers HHMMSS.ss in s; None if they are not written so."""
+    minutes, second = np.divmod(t, 100.0)
+    hour, minute = np.divmod(minutes, 100.0)
+    if (t < 0.0).any() or (second >= 60.0).any() or (minute >= 60.0).any() or (hour >= 24.0).any():
+        return None
+    seconds = 3600.0 * hour + 60.0 * minute + second
+    seconds += _DAY * np.append(0.0, np.cumsum(np.diff(seconds) < -0.5 * _DAY))[:t.size]
+    # The numbers leap by 40 at each full minute, where the time goes on evenly.
+    steps, full = np.diff(seconds), np.diff(minutes) != 0.0
+    within, over = steps[~full & (steps != 0.0)], steps[full]
+    if not over.size or over.size > within.size:
+        return None
+    usual = float(np.median(within))
+    return seconds if abs(np.median(over) - usual) <= 0.5 * usual else None
+
+
+def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: Column,
+              ) -> tuple[FloatArray, str]:
+    """Return the time in s, and its unit in words."""
+    if not time.place:
+        return t, f'{time.scale:g} s'
+    if holds_clocks(form, time.place[0]):
+        return t, 'dates and times'
+    known = t[np.isfinite(t)]
+    steps = np.abs(np.diff(known))
+    usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
+    if len(time.place) > 1:
+        unit, words = 's', ''
+    elif time.unit:
+        unit, words = time.unit if wanted.time_unit else TIME_WORDS[time.unit], ''
+        # Some tools name ms, but write s.
+        if unit in ('ms', 'us') and 0.0 < usual < 1e-3 and not wanted.time_unit:
+            words = f', {usual * SCALES[unit]:.4g} s from row to row: --time-unit s if it is in s'
+    else:
+        if (of_day := _of_day(known)) is not None:
+            t = t.copy()
+            t[np.isfinite(t)] = of_day
+            return t, 'HHMMSS, a guess: --time-unit'
+        # Clocks that count from 1970 show their unit by their size.
+        size = float(np.median(np.abs(known))) if known.size else 0.0
+        span = float(np.ptp(known)) if known.size else 0.0
+        unit = clock_unit(size)
+        if not unit or usual * TIME_UNITS[unit] > LONGEST_STEP:
+            unit = next((name for name, scale in TIME_UNITS.items() if (
+                usual * scale <= _USUAL_STEP and span * scale <= _USUAL_SPAN)), 's')
+        first = next((day for day in _OF_1970 if 0.0 < size - day < _TO_2100), 0.0)
+        if unit == 's' and first and 0.0 < usual < 1e-4:
+            unit, t = 'd', t - first
+        words = '' if unit == 's' else ', a guess: --time-unit'
+    t = t * SCALES[unit]
+    # A unit of minutes or more is no mistake for a finer one; a unit from the user is accepted.
+    if usual * SCALES[unit] > LONGEST_STEP and SCALES[unit] <= 1.0 and not wanted.time_unit:
+        raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
+                         f"'{time.name}': is it in ms, us or ns? Give --time-unit")
+    return t, unit + words
+
+
+def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
+    """Spread rows with equal stamps evenly, if their number per stamp is steady."""
+    # The first row of a stamp is at the stamp, unless rows are missing before it.
+    known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
+    stamps, change = t[known], np.diff(volts[known])
+    begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
+    step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
+    if step.size and (step < 0.0).all():
+        return spread(t[::-1], volts[::-1])[::-1]
+    if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
+        return t
+    usual, first = float(np.median(rows)), change[begin[1:] - 1]
+    # Leave the stamps if the voltage changes only where the stamp does (repeated rows), or always
+    # in one direction where it does (several series in turn).
+    if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
+            first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
+                np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
+                    1.0, _SURE / math.sqrt(first.size)):
+        return t
+    row, even = np.arange(float(known.size)), stamps.copy()
+    pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
+    for part in np.split(begin, pauses):
+        end = begin[begin > part[-1]].min(initial=known.size)
+        # The first and the last stamp may lack rows.
+        x = np.unique(np.append(part[1::_EVEN], part[-1]))
+        rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
+        here = row[part[0]:end]
+        even[part[0]:end] = np.interp(here, x, stamps[x]) + rate * (
+            np.minimum(here - x[0], 0.0) + np.maximum(here - x[-1], 0.0))
+    return t if (np.diff(even) <= 0.0).any() else np.where(
+        np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
+
+
+def in_si(quantity: str, column: Column, values: FloatArray, given: str | None,
+          volts: FloatArray, beside: str) -> tuple[FloatArray, str]:
+    """Return values in V, 0..1 or A, and their unit in words (beside: the voltage's unit)."""
+    known = np.abs(values[np.isfinite(values)])
+    if quantity == logs.THROTTLE:
+        unit = given or SHARE_WORDS.get(column.unit) or PULSE_WORDS.get(column.unit)
+        guess = unit is None
+        if guess and column.name.lower() == 'rc.throttle' and known.size and known.max() > 100.0:
+            unit = _DJI
+        unit = unit or _throttle_unit(values[np.isfinite(values)], volts)
+        # Percentages below 0 are of a stick, except a duty, which is of a motor in reverse.
+        if given is None and unit == '%' and np.mean(values < -MOST_THROTTLE) > WILD and not (
+                re.search('duty|pwm', column.name.lower())):
+            guess, unit = True, '-100:100'
+        words = ', a guess: --throttle-unit' if guess and unit != '1' else ''
+        if unit in ('us', 'ms'):
+            # 0: an output without pulses.
+            values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
+        low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
+        return (values - low) / (high - low), (
+            '0..1' if unit == '1' else unit) + words
+    # Use the maker's factor, unless it makes a supply of less than 1 V: then the numbers were
+    # converted already, under the same names.
+    if column.scale and 'V' not in (given, beside) and (
+            math.isnan(column.unknown) or (known == np.rint(known)).all()) and (
+            quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
+        return np.where(values == column.unknown, np.nan, values * column.scale), column.unit
+    if quantity == logs.CURRENT:
+        small = not column.unit and beside.startswith('mV,') and bool(
+            (known == np.rint(known)).all())
+        unit = 'mA' if small else AMPERE_WORDS.get(column.unit, 'A')
+        return values * SCALES[unit], unit + ', a guess' * small
+    unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
+    if not unit:
+        unit, words = ('mV', ', a guess: --unit') if known.size and np.median(
+            known) > _MOST_VOLTS else ('V', '')
+    return values * SCALES[unit], unit + words
+
+
+def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
+    """Return the unit suggested by the sizes of a throttle; '1' by default."""
+    known = np.abs(values)
+    if not known.size:
+        return '1'
+    low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
+    if low >= 0.8 and 1.1 < high <= 2.2:
+        # Pulses in ms.
+        return '1:2'
+    beyond = known[known > MOST_THROTTLE]
+    # With a voltage within 0 to 1 it may be the voltage: `check_throttle` reports it.
+    if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
+        return '1'
+    if high <= 110.0:
+        return '%' if high > _LEAST_PERCENT else '1'
+    negative = float(np.mean(values < -MOST_THROTTLE)) > WILD
+    if np.quantile(known[known > 0.0], WILD) >= 800.0 and high <= 2200.0 and not negative:
+        return 'us'
+    if negative:
+        return next((f'{-end}:{end}' for end in _STICKS if high <= end), '1')
+    # The thrust of a Crazyflie; other counts end at 10 000 at most.
+    return '0:65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (
+        high > 32768.0 or (values == np.rint(values)).all()) else '1'
