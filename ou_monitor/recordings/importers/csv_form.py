@@ -80,7 +80,7 @@ _INTERVAL = re.compile(
     r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?[tx]|h_?resolution|'
     rf'clock(?=\W*{_NUMBER}[nuµm]?s\b)|sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
     r'["\s]*+(?:[\[(](\w+)[\])])?+'
-    rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+([a-zµμ]*+)',
+    rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+([a-zµμ]*+)(/?)',
     re.IGNORECASE)
 # A prefix of units, in any letter case except for m and M.
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'μ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'g': 1e9, '': 1.0}
@@ -480,8 +480,10 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
             return float(cell), name
     for line in lines:
         if found := _INTERVAL.search(line):
-            words, unit, number, word = found.groups()
-            rate = re.search('rate|frequency', words, re.IGNORECASE)
+            words, unit, number, word, per = found.groups()
+            # Some loggers call the time between rows a rate: 10 ms.
+            rate = re.search('rate|frequency', words, re.IGNORECASE) and (
+                per or TIME_WORDS.get(word, 's') == 's')
             prefix = word[:1] if re.match('s|hz|$', word[1:].lower()) else ''
             value = float(number) * (
                 SCALES[TIME_WORDS[word.casefold()]] if not rate and word.casefold() in TIME_WORDS

@@ -474,6 +474,7 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     (' 0  12  0.1\n 1  13  0.2\n', CsvColumns(voltage='column 2'), 1.0, [12, 13]),
     # Minutes are not milli.
     ('Sampling interval: 1.5 min\nNo.,U\n0,12\n1,13\n', CsvColumns(), 90.0, [12, 13]),
+    ('Sampling rate: 10 ms\nNo.,U\n0,12\n1,13\n', CsvColumns(), 0.01, [12, 13]),
     # HHMMSS over midnight.
     ('time,U\n235958,12\n235959,13\n0,14\n1,13\n', CsvColumns(), 1.0, [12, 13, 14, 13]),
     # Excel's mm:ss.0 drops the hours.
