@@ -65,9 +65,12 @@ def usual_change(voltage: FloatArray) -> float:
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
     size = np.sort(np.abs(np.diff(voltage[:EXAMINED])))
     size = size[size > rounding]
-    first = np.flatnonzero(np.diff(size, prepend=-np.inf) > rounding)
-    count = np.diff(first, append=size.size)
-    return float(size[first[count.argmax()]]) if count.max(initial=0) >= _AGAIN else 0.0
+    # Equal sizes, and as many as that within ten times this distance: the changes of a smooth line
+    # crowd too, but evenly.
+    begin, end, near, far = (np.searchsorted(size, size + by * rounding, side) for by, side in (
+        (-0.5, 'left'), (0.5, 'right'), (-5.0, 'left'), (5.0, 'right')))
+    count = np.where(2 * (end - begin) > far - near, end - begin, 0)
+    return float(size[count.argmax()]) if count.max(initial=0) >= _AGAIN else 0.0
 
 
 def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float:

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.criticism.adc import find_rails, find_step
+from ou_monitor.criticism.adc import find_rails, find_step, usual_change
 import pytest
 from scipy.signal import lfilter
 
@@ -139,3 +139,15 @@ def test_a_value_far_from_all_others_is_no_rail():
     for gap, found in ((0.15, True), (0.25, False)):
         v = np.concatenate((others, np.full(60, gap)))
         assert (find_rails(rng.permutation(v), 0.0, 1.0)[1] == gap) == found
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_changes_of_a_fast_line_that_crowd_are_no_codes(seed):
+    """The changes of a sine crowd at its steepest; those of codes with an offset are equal."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(25000) / 504.0
+    v = 21.25 + 0.5 * np.sin(2.0 * np.pi * 24.3 * t) + 0.02 * rng.standard_normal(t.size)
+    assert usual_change(v) == 0.0
+    codes = 0.01 * np.rint(v / 0.01) + 0.0037 * (np.arange(t.size) // 5000)
+    steps = usual_change(codes) / 0.01
+    assert steps > 0.5 and steps == pytest.approx(round(steps))
