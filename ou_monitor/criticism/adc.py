@@ -67,9 +67,9 @@ def usual_change(voltage: FloatArray) -> float:
     size = size[size > rounding]
     # Equal sizes, and as many as that within ten times this distance: the changes of a smooth line
     # crowd too, but evenly.
-    begin, end, near, far = (np.searchsorted(size, size + by * rounding, side) for by, side in (
-        (-0.5, 'left'), (0.5, 'right'), (-5.0, 'left'), (5.0, 'right')))
-    count = np.where(2 * (end - begin) > far - near, end - begin, 0)
+    same, near = (np.searchsorted(size, size + by * rounding, 'right')
+                  - np.searchsorted(size, size - by * rounding) for by in (0.5, 5.0))
+    count = np.where(2 * same > near, same, 0)
     return float(size[count.argmax()]) if count.max(initial=0) >= _AGAIN else 0.0
 
 

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import (
-    evaluate, gradients, slopes_of, solved, whitened, with_mean)
+    evaluate, Events, GaussianFit, gradients, slopes_of, solved, whitened, with_mean)
 from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
@@ -160,6 +160,10 @@ _FAR = 1.5
 # Maximum mean loss from errors of the parameters, nats per sample; at the limit they are as large
 # as the noise.
 _UNKNOWN = 0.5
+# Maximum number of times that a step is halved; then only the mean is fitted again.
+_HALVINGS = 5
+# Loss of likelihood of the other blocks, nats, up to which a step counts as right.
+_ROUGH = 0.1
 # Margin by which throttle may exceed the range of the other blocks: share of that range, minimum.
 _BEYOND, _STILL = 0.05, 0.01
 # After throttle that no other block contains, samples are not scored for this time, s; most lags
@@ -210,10 +214,8 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
             known[b] = False
             continue
         step = np.clip(-inverse @ score[b].sum(axis=0), -_FAR, _FAR)
-        try:
-            there = evaluate(data, with_mean(all_moved(terms, free, step), beta), events,
-                             inside=True)
-        except ValueError:
+        there = _refitted(data, terms, events, free, step, beta, base.density, b)
+        if there is None:
             # No valid model without the block.
             known[b] = False
             continue
@@ -223,6 +225,24 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
     laws = model.free - sum(len(term.free()) + len(term.LINEAR) for term in terms) - 1
     density -= (laws + model.search) / samples.n
     return HeldOut(model, density, known & np.isfinite(density), error)
+
+
+def _refitted(data: Samples, terms: Sequence[Term], events: Events | None,
+              free: Sequence[tuple[int, str]], step: FloatArray, beta: FloatArray,
+              density: FloatArray, block: slice) -> GaussianFit | None:
+    """Return the model without a block: its step, halved until it suits the other blocks."""
+    # A step of parameters that the likelihood hardly tells apart can be far too long.
+    others = np.ones(density.size, dtype=np.bool_)
+    others[block] = False
+    for turn in range(_HALVINGS + 1):
+        moved = all_moved(terms, free, step * 0.5 ** turn if turn < _HALVINGS else 0.0 * step)
+        try:
+            there = evaluate(data, with_mean(moved, beta), events, inside=True)
+        except ValueError:
+            continue
+        if turn == _HALVINGS or float((there.density - density)[others].sum()) > -_ROUGH:
+            return there
+    return None
 
 
 def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: float = Z95

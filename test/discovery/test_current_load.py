@@ -7,17 +7,18 @@ import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.cli.recorded import model_text
 from ou_monitor.criticism.readings import load_of
-from ou_monitor.errors import InputError
 from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import timing
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.recordings.model_file import parse_model
 from ou_monitor.report.discovery_document import discovery_document
 from ou_monitor.report.terminal import terminal
 import pytest
 from scipy.signal import lfilter
+import yaml
 
 RATE, N = 100.0, 3000
 T = np.arange(N) / RATE
@@ -37,7 +38,7 @@ def sagged(load, seed=4):
 
 
 def test_the_measured_current_is_the_load_where_it_says_more():
-    """Throttle that moves on its own explains nothing; the model is not for throttle then."""
+    """Throttle that moves on its own explains nothing; the model is for the current."""
     u, current = flown(4), 30.0 * flown(5)
     v = sagged(current / 30.0)
     recording = Recording(T, v, u, 'made', current=current)
@@ -49,8 +50,8 @@ def test_the_measured_current_is_the_load_where_it_says_more():
     shown = ' '.join(terminal(discovery_document(found)).split())
     assert 'throttle' not in shown.replace('better than throttle', '')
     assert re.search(r'Where current is [0-9.]+ A or more, .* it is [0-9.]+ A or less', shown)
-    with pytest.raises(InputError, match='current'):
-        model_text(found, recording)
+    saved = parse_model(yaml.safe_load(model_text(found, recording)), 'm.yaml')
+    assert saved.model.full_current == pytest.approx(found.full)
     alone = discover(Recording(T, v, u, 'made'))
     assert alone.load == 'throttle' and found.gain > alone.gain + 4.0 * found.gain_se > 0.0
 

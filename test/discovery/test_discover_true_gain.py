@@ -12,6 +12,7 @@ from ou_monitor.discovery.gain import (
     blocks_of, covered, gain_of, held_out)
 from ou_monitor.discovery.load_effects import low_dips
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
@@ -216,3 +217,13 @@ def test_the_extended_model_dips_as_often_as_the_data(name):
     error = math.sqrt(float((spread**2).sum()) * (1.0 + 1.0 / 8 + 1.0 / 1.5)) / 8
     assert abs(np.mean(extended - observed)) < 3.5 * error
     assert abs(np.mean(baseline - observed)) > 3.5 * error
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_parameters_that_the_likelihood_hardly_tells_apart_do_not_hide_a_gain(seed):
+    """A high-pass about as fast as the rail: 0.03 nats a sample, 130 in all."""
+    t = np.arange(4300) / 109.0
+    model = SupplyModel((OU(48.5, 0.18, 4.09), ACCoupling(corner=11.6, offset=4.09)))
+    found = discover(Recording(t, model.simulate(t, np.random.default_rng(seed)))).record
+    (cause,) = found.causes
+    assert cause.name == 'ac_coupling' and cause.gain == pytest.approx(0.03, abs=0.01)
