@@ -55,6 +55,9 @@ def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float
     """Return the pack's limit, V, and number of cells: as given, else as the log states them."""
     from ou_monitor.analysis.crafts import check_cells, full_voltage, pack_limit, stated_limit
 
+    for name, value in (('brownout_voltage', limit), ('cells', cells)):
+        if value is not None and not isinstance(value, (int, float, np.number)):
+            raise TypeError(f'{name} must be a number, got {value!r}')
     if cells:
         check_cells(full_voltage(recording), cells)
     if (given := pack_limit(limit, cells)) is not None:

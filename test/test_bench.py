@@ -241,7 +241,9 @@ def test_the_namespace_is_light():
 @pytest.mark.parametrize('call, words', [
     (lambda: design(FLIGHT), 'got a str: pass a Recording or a path as recording='),
     (lambda: design(Recording([0.0, 1.0], [5.0, 5.1])), 'got a Recording: pass'),
-    (lambda: analyze({'voltage': [5.0]}), 'a Recording or a path is needed, got a dict')])
+    (lambda: analyze({'voltage': [5.0]}), 'a Recording or a path is needed, got a dict'),
+    (lambda: analyze(FLIGHT, brownout_voltage='14 V'), "brownout_voltage must be .*'14 V'"),
+    (lambda: analyze(FLIGHT, cells='4'), "cells must be a number, got '4'")])
 def test_an_argument_of_a_wrong_type_is_named(call, words):
     with pytest.raises(TypeError, match=words):
         call()

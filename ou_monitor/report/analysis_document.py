@@ -107,7 +107,9 @@ def _budget(analysis: Analysis) -> str:
             + f'within {curves.horizon:g} s')
     if math.isnan(curves.budget):
         reason = (curves.budget_reason if analysis.recording.has_throttle else
-                  'the recording has no throttle')
+                  'the recording has no throttle' + (
+                      '; ou-monitor design --from RECORDING takes the current as the load'
+                      if math.isfinite(analysis.overview.facts.resistance.ohm) else ''))
         return f'unknown: {reason}'
     if not curves.budget:
         return (f'no throttle, {_why_no_throttle(analysis)}: the risk {what} is '
