@@ -251,17 +251,6 @@ def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.
     return f'No measurable gain on samples not used for the fit ({size}).{named}'
 
 
-def overlap_words(causes: Sequence[Cause], gain: float) -> str:
-    """Explain why single gains exceed the gain of the whole model, nats; empty if none does."""
-    larger = list(dict.fromkeys(
-        c.name for c in causes if c.measurable and c.gain > max(gain, 0.0) + Z95 * c.gain_se))
-    if not larger:
-        return ''
-    return (f'Without {" or without ".join(larger)} the rest of the model predicts worse than the '
-            'plain OU. The gain of a cause can thus exceed the gain of the whole model: gains '
-            'overlap and do not add up.')
-
-
 def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
     """Return why a gain cannot be measured, and which recording would measure it."""
     few = (f'only {scored} samples can be scored, fewer than {fewest}' if scored

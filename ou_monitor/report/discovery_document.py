@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.words import (
-    both_names, by_load, cause_rows, curve_text, GAIN, gain_text, overlap_words, parameters,
+    both_names, by_load, cause_rows, curve_text, GAIN, gain_text, parameters,
     plain_words, with_error)
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 from ou_monitor.model.terms.term import Role
@@ -100,8 +100,7 @@ def _causes(finding: Finding) -> list[Part]:
                 row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
                for row in found], left=[0, 1, 2, 5]),
         Text(GAIN),
-        Notes.of([overlap_words(finding.causes, finding.gain),
-                  *(f'{row.label}: {row.explanation}' for row in found)]),
+        Notes.of([f'{row.label}: {row.explanation}' for row in found]),
         Text('The gain of a cause is the loss of held-out score when it is left out and the rest '
              'is fitted again; its error combines the scatter of block means and the errors of '
              'the parameters. p: twice the smaller of two p-values: the likelihood '

@@ -6,7 +6,7 @@ import re
 
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.words import (
-    both_names, cause_rows, coupling_note, explain, gain_text, gain_words, overlap_words,
+    both_names, cause_rows, coupling_note, explain, gain_text, gain_words,
     parameters, plain, PLAIN_NAMES, plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise
@@ -65,14 +65,6 @@ def test_a_positive_parameter_is_shown_if_known_to_a_factor_of_10(error, text):
     (0.9e-3, '< 0.001'), (1.1e-3, '0.0011'), (0.25, '0.25')])
 def test_p_values_are_written_with_one_rule(chance, text):
     assert cause_rows([replace(SAG, p_value=chance)])[0].chance == text
-
-
-@pytest.mark.parametrize('gain, whole, said', [
-    (0.026, 0.02, True), (0.0258, 0.02, False), (0.006, -0.5, True), (0.0058, -0.5, False)])
-def test_single_gains_larger_than_the_whole_are_said(gain, whole, said):
-    """By 1.96 errors of 3 mnat; a whole that loses counts as none."""
-    cause = replace(SAG, gain=gain, gain_se=0.003)
-    assert bool(overlap_words([cause], whole)) == (said and cause.measurable)
 
 
 def tone_cause(frequency, explanation):
