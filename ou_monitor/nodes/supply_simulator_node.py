@@ -187,7 +187,7 @@ class SupplySimulatorNode(MonitorNode):
             raise InputError('throttle.play: the msg_config has no throttle to publish it on')
         sender = Sender(self, self._throttle_source)
         if is_recording(text):
-            found = read_throttle(text)
+            found = read_throttle(text, full=self._model.full_current)
             return found.profile, found.duration, sender
         return read_profile(text), math.inf, sender
 
