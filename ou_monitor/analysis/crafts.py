@@ -59,8 +59,8 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
            '3s_erpm2': (3, 0.289, 0.214, NAN), 'ar8': (6, 1.889, 0.050, NAN),
            'hiro': (4, 0.521, 0.767, NAN), 'roma': (6, 1.178, 0.537, 0.0351),
            'erle': (3, 0.665, 0.109, NAN), 'jd': (4, 0.398, NAN, 0.0175)},
-    # DTU REGBOT (zachasme/regbot), where sag and resistance are known; an FRC robot of 2022 with a
-    # lead-acid battery (orangelight/DSLOG-Reader), which counts as 3 cells.
+    # DTU REGBOT (zachasme/regbot), NaN if sag or resistance is unknown; an FRC robot of 2022
+    # with a lead-acid battery (orangelight/DSLOG-Reader), which counts as 3 cells.
     ROBOT: {'regbot_10': (3, 0.043, 0.0058, NAN), 'regbot_19': (3, 0.063, 0.0113, NAN),
             'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
             'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),

@@ -273,7 +273,7 @@ _ANALYZE = Command(
     'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
     '95 % intervals, and the type of process.',
     (RECORDING, levels('found'), *PART,
-     *estimate('lowest permitted voltage, V (default: 4.5, as for the node)'),
+     *estimate('lowest permitted voltage, V (default: 4.5 for a 5 V rail)'),
      *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --cells 4 --report flight.html',
      'flight.mcap --brownout-voltage 14 --from 10 --to 70',

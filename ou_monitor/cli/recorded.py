@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def analyze(args: argparse.Namespace) -> int:
-    """Run `analyze`: the paper's Tables 1 and 2 for a recording."""
+    """Run `analyze`: the facts of a supply, and the noise of each load level."""
     given = _bench_arguments(args, 'levels', 'window', 'brownout_horizon')
     output.deliver(args, _read_and_run(args, 'analyzing', bench.analyze, given)[1])
     return 0

@@ -31,9 +31,9 @@ _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 _POINTS = 2000
 # Minimum probability of the other kind of level (constant or falling) to be reported.
 _UNSURE = 0.05
-# Minimum time at the beginning over which a model from a file is aligned with the recording, s; it
-# is doubled until the mean of a simulation varies less than this share of single samples, that is
-# until it holds some ten independent pieces.
+# Minimum time at the beginning over which a model from a file is aligned with the recording, s.
+# It is doubled until the deviation of a simulation's mean over it is below this share of the
+# deviation of single samples, that is until it holds about ten independent pieces.
 _ALIGNED, _STEADY = 2.0, 0.3
 
 

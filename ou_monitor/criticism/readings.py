@@ -34,14 +34,14 @@ _ODD, _ODD_SHARE = 3, 1e-3
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
-# Largest throttle, with trim, and tolerance of the range 0..1; the readers refuse other units.
+# Largest throttle, with trim, and tolerance of the range 0..1; readers convert or refuse units.
 _MOST, _EDGE = 1.5, 0.05
 # Maximum gap in a current, s; quantile of its size taken as full load; lags of the mean response
 # to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
 # Probability that an unrelated current is taken as the load if there is no throttle.
 _CHANCE = 0.02
-# Minimum autocorrelation of which a decay is taken.
+# Minimum autocorrelation from which a decay is computed.
 _CORRELATED = 0.1
 # Two levels of a voltage: minimum distance, in standard deviations about them and in ADC steps;
 # minimum switches, samples per switch, and share of the samples at each level.
@@ -111,7 +111,7 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     gain = _gain(t[some], v[some], current[some]) - (
         0.0 if u is None else _gain(t[some], v[some], u[some]))
     limit = 0.5 * _LAGS.size * math.log(v.size)
-    # Without throttle it only has to be related: causes over load have to earn their place.
+    # Without throttle, any clear relation is enough: causes that need a load are tested later.
     least = 0.5 * float(chdtri(2 + _LAGS.size, _CHANCE)) if u is None else -limit
     if not full or gain < least:
         notes += moved

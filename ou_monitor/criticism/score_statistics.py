@@ -341,7 +341,7 @@ def covariates_of(samples: Samples, composite: Composite) -> Covariates:
 
 # Number of simulated recordings.
 SIZE = 24
-# Weight, in recordings, of the theoretical mean 0 and spread 1 in the estimated ones.
+# Weight of the theoretical mean 0 and spread 1 in averages with the estimated ones, in recordings.
 _PRIOR = 24.0
 # Degrees of freedom of a score divided by its spread: if the m draws have weight w, the squared
 # spread has variance w^2 2/(m - 1), like a chi square with (m - 1)/w^2 degrees.  Of 8700 plain OU

@@ -338,7 +338,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
         # If a step gains what the parabola predicts, the maximum is reached.  A full fit goes on,
-        # because its errors need the slopes at the maximum.
+        # because its standard errors need the slopes at the maximum.
         if gain < (_NEARLY if rough else _SETTLED) or (
                 rough and abs(gain - predicted) < _NEARLY):
             break

@@ -34,7 +34,7 @@ class Criticism:
     # Normal score of the data under the plain and under the extended model.
     before: float
     after: float
-    # Band: any statistic leaves its band in one of a hundred recordings of a correct model.
+    # Band: in one of a hundred recordings of a correct model, some statistic leaves its band.
     low: float
     high: float
     # Probability that any statistic of a correct model is as far off.

@@ -145,7 +145,7 @@ class _BoundedLoader(yaml.SafeLoader):
         super().__init__(text)
         self._most_nodes = most_nodes
         self._nodes = self._depth = self._aliases = 0
-        # Anchor -> number of nodes it expands to; anchors still open are not in it.
+        # Anchor -> number of nodes it expands to; it is entered once its node is complete.
         self._sizes: dict[str, int] = {}
 
     def compose_node(self, parent: Any, index: Any) -> Any:

@@ -15,8 +15,8 @@ Each law is mixed with a wider one, whose weight is the share of horizons that c
 step / horizon where horizons overlap.  For first passage the other method takes the place of the
 wider law.  For a given throttle the wider law has the width of the excursions, but at most
 `_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
-irrelevant to idling.  It is wider still if the contradicting voltages were farther below the mean
-of the law.
+irrelevant to idling.  It grows if the contradicting voltages lie farther below the mean of the law
+than this width.
 
 Limits, in addition to doc/risk.md: all throttles share one bias and one gain; values between two
 horizons are interpolated.
@@ -98,7 +98,11 @@ def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) ->
 
 
 class LowestLaw:
-    """`values`: bias b0, gain b1, variances k0 to k2, and covariance of b0 and b1 (3 values)."""
+    """
+    Law of the lowest voltage.
+
+    values: bias b0, gain b1, variances k0 to k2, and covariance of b0 and b1 (3 values).
+    """
 
     def __init__(self, values: FloatArray) -> None:
         self.values = values
