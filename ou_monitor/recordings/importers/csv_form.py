@@ -53,6 +53,10 @@ _IN_A_ROW = 8
 # Steps of the time by which it leaps from a row that numbers the columns to the data.
 _LEAP = 10.0
 
+# Columns of `ros2 topic echo --csv` of a sensor_msgs/BatteryState, up to its cells.
+_BATTERY_STATE = ('sec nanosec frame_id voltage temperature current charge capacity '
+                  'design_capacity percentage status health technology present').split()
+
 # First characters of a comment line.
 COMMENTS = ('#', '%')
 DELIMITERS = {'tab': '\t', 'space': ' '}
@@ -382,14 +386,36 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
         comments += [(k, [cell.strip() for cell in cells])
                      for cells in either if len(cells) == width > 1][:1]
     names, units, line = next((found for above in (plain, comments) if (
-        found := _names_and_units(above, width, needed))), (
-            [f'column {k + 1}' for k in range(width)], [], 0))
+        found := _names_and_units(above, width, needed))), ([], [], 0))
+    names = names or _names_in_rows([row for row in rows[first:] if any(row)], width)
     # A label before the names is not a column's name if another line has one before its numbers.
     some = _trimmed(names)
     labelled = needed and needed == {*range(len(some) - 1)} and _OF_NAMES.search(some[0]) and any(
         list(map(is_value, _trimmed(row))) == [False] + [True] * len(needed)
         for row in rows[skip:first])
     return some[1:] if labelled else names, units, line
+
+
+def _names_in_rows(rows: list[list[str]], width: int) -> list[str]:
+    """Return names for the columns of rows without a header, as far as the rows show them."""
+    numbered = [f'column {k + 1}' for k in range(width)]
+    if rows and all(map(_is_battery_state, rows)):
+        return _BATTERY_STATE + numbered[len(_BATTERY_STATE):]
+    # Dumps of MAVLink name each number in the cell at its left; a single name may be a frame's.
+    before = [{row[k] if is_number(row[k + 1]) else '' for row in rows}
+              for k in range(min(map(len, rows), default=0) - 1)]
+    named = {k + 1: name for k, words in enumerate(before) if len(words) == 1 and re.fullmatch(
+        r'[A-Za-z]\w+', name := min(words)) and not is_missing(name)
+        and name.lower() not in {*WORDS, *OTHER_WORDS}}
+    return [named.get(k, name) for k, name in enumerate(numbered)] if (
+        1 < len(named) == len({*named.values()})) else numbered
+
+
+def _is_battery_state(row: list[str]) -> bool:
+    """Return whether the cells are those of a sensor_msgs/BatteryState."""
+    counts = [*row[:2], *row[10:13]]
+    return row[13:14] in (['True'], ['False']) and all(map(str.isdigit, counts)) and all(
+        is_number(cell) or is_missing(cell) for cell in row[3:10])
 
 
 def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set[int],
@@ -405,8 +431,10 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
         # Below the line of units, one of sources may follow.
         above = next((above[:k + 1] for k in range(len(above) - 1, 0, -1) if _are_units(
             above[k][1]) and names_all(above[k - 1][1])), above)
+    # A fact with a decimal number is not a line of names.
     if len(above) > 1 and _are_units(above[-1][1]) and len(above[-2][1]) >= min(
-            width, len(above[-1][1])):
+            width, len(above[-1][1])) and not any(
+                '.' in cell and is_number(cell) for cell in above[-2][1]):
         units = [cell.strip('[](){} ').lower() for cell in above.pop()[1]]
     if not above:
         return None
@@ -437,17 +465,38 @@ def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: 
     stated = [words[k] if k < len(words) and words[k] in WORDS else name.lower()
               if name in bare and len(bare) > 1 else unit_of(name)[1]
               for k, name in enumerate(names)]
-    # Else the unit of a channel in a line above, such as 'Vertical Units,V,CH2:A'.
+    # Else the unit of a channel in a line above.
     begin = int(rows[at - 1][1:len(names) + 1] != names)
-    for k, cell in ((k, cell) for row in rows[:first] if row and 'unit' in row[0].lower()
-                    for k, cell in enumerate(row[1:], begin) if k < len(stated) and not stated[k]):
-        word = cell.split(':')[-1].strip().lower()
-        stated[k] = word if word in VOLT_WORDS or word in AMPERE_WORDS else ''
+    stated = [unit or _unit_above(names, k, begin, rows[:first]) for k, unit in enumerate(stated)]
     # Else the unit behind the first number of the column.
     for k, unit in enumerate(stated):
         cell = next((row[k] for row in rows[first:] if k < len(row) and is_number(row[k])), '0')
         stated[k] = unit or number_of(cell)[1] or _unit_beside(names, rows[first:], k)
     return tuple(stated)
+
+
+def _unit_above(names: list[str], k: int, begin: int, above: list[list[str]]) -> str:
+    """Return the unit of volts or amperes of a column in the lines above; '' if none states it."""
+    # At the end of the channel's own line, such as 'CH2,DC,50mV,A', or in a line such as
+    # 'Vertical Units,V,CH2:A': below the channel's name, or in the order of the columns.
+    if k < begin:
+        return ''
+    place = k + 1 - begin
+    label = next((p for row in above for p, cell in enumerate(row) if p and cell == names[k]),
+                 place)
+    for row in filter(None, map(_trimmed, above)):
+        cells = [row[-1]] if k and len(row) > 1 and row[0] == names[k] else []
+        if 'unit' in row[0].lower():
+            cells = [*row[label:label + 1], *row[place:place + 1]]
+            # Blank cells between the units.
+            units = [cell for cell in row[1:] if cell]
+            if len(units) == len(names) - begin < len(row) - 1:
+                cells = [units[place - 1]]
+        for cell in cells:
+            word = cell.split(':')[-1].strip().lower()
+            if word in VOLT_WORDS or word in AMPERE_WORDS:
+                return word
+    return ''
 
 
 def has_unit_beside(names: Sequence[str], place: int) -> bool:

@@ -237,7 +237,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
         asked = {*more}
         more, time = form.names, time._replace(place=())
     found = _supply_of(path, form, wanted, time, needed)
-    others = {name: form.names.index(name) for name in more if name in form.names}
+    others = {name: place for name in more if (place := _place_of(form, name)) is not None}
     for name, place in others.items():
         if place in time.place:
             raise InputError(f"{path}: '{name}' is the time, not a signal")
@@ -329,10 +329,19 @@ def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
     return f"{path}:{form.line or form.skip + 1}: no column '{name}': {hint}" + option
 
 
+def _place_of(form: Form, name: str | None) -> int | None:
+    """Return the place of a column by its name, or by 'column 1' and so on; None: it is absent."""
+    if name in form.names:
+        return form.names.index(name)
+    found = re.fullmatch(r'column ([1-9]\d{0,8})', name or '')
+    return int(found[1]) - 1 if found and int(found[1]) <= len(form.names) else None
+
+
 def _column_place(path: Path, form: Form, name: str, option: str) -> int:
-    if name not in form.names:
+    place = _place_of(form, name)
+    if place is None:
         raise InputError(_absent(path, form, name, f' ({option} names another)'))
-    return form.names.index(name)
+    return place
 
 
 def _plain_names(form: Form) -> list[str]:
@@ -395,6 +404,8 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> Column:
             return Column((beside[0], first),
                           f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
+    if 'sec' in form.names and (parts := _parts_of_second(form, form.names.index('sec'))):
+        return parts
     filled = _nameless_columns(form)
     # The first column that goes on in every row, else the first if it never goes back.
     rising = [k for k in filled[:len(filled) - 1] if len(form.rows) >= _FEW_ROWS and (
@@ -502,8 +513,8 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: Column, needed:
     names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
              logs.THROTTLE: (wanted.throttle, '--throttle-column', wanted.throttle_unit),
              logs.CURRENT: (wanted.current, '--current-column', None)}
-    given = [form.names.index(name) for name in (
-        wanted.time, *(name for name, *_ in names.values())) if name in form.names]
+    given = [place for name in (wanted.time, *(name for name, *_ in names.values()))
+             if (place := _place_of(form, name)) is not None]
     taken = [*time.place, *given]
     currents = {_stem(form.names[k]) for k in _choose(form, logs.CURRENT, taken)}
     found: dict[str, Column] = {}
@@ -559,7 +570,7 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: Column,
     """Return the form of the series that rows name, and the columns of their names and values."""
     named = _choose(form, logs.VOLTAGE, time.place)
     if not form.line or not time.place or (
-            named if wanted.voltage is None else wanted.voltage in form.names):
+            named if wanted.voltage is None else _place_of(form, wanted.voltage) is not None):
         return None
     places = [k for k in range(min(form.width, len(form.names))) if k not in time.place]
     value = [k for k in places if holds_numbers(form, k, False) and re.fullmatch(

@@ -71,6 +71,14 @@ FORMS = {
          'Record Length,60', 'Probe Attenuation,10', 'Vertical Units,V,A', 'Label,,',
          'TIME,CH1,CH2'],
         lambda k: f'{1e-5 * k:.6e},{V[k]:.4f},{AMPS[k]}'), 1e-5, False, True),
+    # A blank cell between the units; a line that has names and units at other cells.
+    'tektronix_mso': (table(
+        ['Model,MSO2014', 'Horizontal Units,S,,S', 'Vertical Units,V,,A', 'Label,,,',
+         'TIME,CH1,CH2'], lambda k: f'{1e-5 * k:.6e},{V[k]:.4f},{AMPS[k]}'), 1e-5, False, True),
+    'tektronix_5': (table(
+        ['Model,MSO58,,Channel,CH1,,Channel,CH2', 'Horizontal Units,s,,,,,,',
+         'Vertical Units,s,,Vertical Units,V,,Vertical Units,A', '', 'TIME,CH1,CH2'],
+        lambda k: f'{1e-5 * k:.6e},{V[k]:.4f},{AMPS[k]}'), 1e-5, False, True),
     'siglent': (table(['Record Length,Analog:60', 'Sample Interval,CH1:1.00E-5', 'Vertical Units,'
                        'CH1:V', 'Model Number,SDS1104', 'Source,CH1', 'Second,Volt'],
                       lambda k: f'{1e-5 * k:.7f},{V[k]:.3f}'), 1e-5, False, False),
@@ -195,6 +203,13 @@ FORMS = {
                         'Number,Date&Time,ms,CH1,CH2,Alarm1', 'NO.,Time,ms,V,A,A1234567890'],
                        lambda k: f"{k},{clock(k, '%Y/%m/%d %H:%M:%S')},{10 * k % 1000},"
                                  f'+{V[k]},+{AMPS[k]:7.2f},LLLLLLLLLL'), 0.01, False, True),
+    # The unit at the end of each channel's line.
+    'graphtec_amp': (table(['Sampling interval,100ms', 'AMP settings',
+                            'CH,Signal name,Amp,Input,Range,Filter,Span,,Unit',
+                            'CH3,U,M,DC,50V,Off,25,-25,V', 'CH4,I,M,DC,50mV,Off,20,-20,A', 'Data',
+                            'Number,Date,Time,us,CH3,CH4,Alarm'],
+                           lambda k: f"{k + 1},{clock(k, '%Y/%m/%d,%H:%M:%S,%f', 0.1)},"
+                                     f'+{V[k]},+{AMPS[k]},LLLL'), 0.1, False, True),
     'keithley': (table(['Model,DMM6500', '', 'Index,Reading,Unit,Range Digits,Date,Time,'
                         'Fractional Seconds,Relative Time,Channel'],
                        lambda k: f"{k + 1},{V[k]:.6E},Volt DC,5.5,{clock(k, '%m/%d/%Y')},"
@@ -287,6 +302,10 @@ FORMS = {
     'ros2_topic_echo': (table([], lambda k: (
         f'{1700000000 + k // 40},{25000000 * (k % 40)},base_link,{V[k]},nan,{-AMPS[k]},0.9,True')),
         0.025, False, False),
+    'ros2_battery_state': (table([], lambda k: (
+        f'{1700000000 + k // 40},{25000000 * (k % 40)},battery,{V[k]},nan,{AMPS[k]},'
+        f'{5.2 - 1e-4 * k:.4f},nan,5.2,{1.0 - 2e-5 * k:.5f},2,1,3,True,'
+        f'{V[k] / 4.0:.3f},3.9,3.9,3.9,,,')), 0.025, False, True),
     # The format of Arduino's serial plotter, in its serial monitor.
     'serial_plotter': (table([], lambda k: clock(k, '%H:%M:%S.%f') + (
         f' -> Voltage:{V[k]},Current:{AMPS[k]},Throttle:{100 * U[k]:.1f}')), 0.01, True, True),
@@ -506,6 +525,48 @@ def test_fields_of_mavlink_have_its_units(cells, given, volts, amps, tmp_path):
         np.testing.assert_allclose(found.current, amps)
     said = ' '.join(found.notes)
     assert ('mV by MAVLink' in said) == (given != 'V' and '.' not in cells)
+
+
+def test_a_name_at_the_left_of_each_number_names_its_column(tmp_path):
+    """
+    As in dumps of MAVLink; the number of a column names it too.  A unit is no name.
+
+    If no name tells the voltage, the steadiest column is taken as before.
+    """
+    path = written(tmp_path, table([], lambda k: (
+        f'{clock(k)},FD, 0,sys_status_t,load,305,voltage_battery,{1e3 * V[k]:.0f},'
+        f'current_battery,{1e2 * AMPS[k]:.0f},errors_count1,0,sig ,Len,43')))
+    for columns in (None, CsvColumns(voltage='column 8', current='column 10')):
+        found = read_recording(path, columns=columns)
+        np.testing.assert_allclose(found.t - found.t[0], 0.01 * K, atol=1e-6)
+        np.testing.assert_allclose(found.voltage, V)
+        np.testing.assert_allclose(found.current, AMPS)
+        assert found.source['current'] == 'current_battery'
+    path = written(tmp_path, table([], lambda k: f'{k},mV,{V[k]},mA,{AMPS[k]}'))
+    found = read_recording(path, columns=CsvColumns(voltage='column 3', current='column 5'))
+    assert (found.source['voltage'], found.source['current']) == ('column 3', 'column 5')
+    path = written(tmp_path, table([], lambda k: f'{k},{V[k]},armed,{U[k]},state,{k % 3}'))
+    np.testing.assert_allclose(read_recording(path).voltage, V)
+
+
+def test_a_fact_with_a_decimal_number_does_not_name_the_columns(tmp_path):
+    """The line below it is of names, which are units."""
+    found = read_recording(written(tmp_path, table(
+        ['Record Length,Analog:60', 'Horizontal Scale, 0.500000000', 'Second,Volt'],
+        lambda k: f'{1e-5 * k:.11f},{V[k]:.5f}')))
+    np.testing.assert_allclose(found.voltage, V)
+    np.testing.assert_allclose(found.t, 1e-5 * K, atol=1e-9)
+    assert found.source['voltage'] == 'Volt'
+
+
+def test_a_battery_state_without_a_header_keeps_the_sign_of_its_current(tmp_path):
+    """Its charge, which rises here, is not taken for the time, nor its nanoseconds for stamps."""
+    found = read_recording(written(tmp_path, table([], lambda k: (
+        f'12,{2500000 * k},,{V[k]},nan,{-AMPS[k]},{5.0 + 1e-4 * k:.4f},nan,nan,0.9,2,1,3,False,,,'
+    ))))
+    np.testing.assert_allclose(found.t - found.t[0], 0.0025 * K, atol=1e-6)
+    np.testing.assert_allclose(found.voltage, V)
+    np.testing.assert_allclose(found.current, -AMPS)
 
 
 @pytest.mark.parametrize('firmware, name, volts', [
