@@ -59,9 +59,15 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         notes.append('The errors of the parameters in the model file are not simulated: the '
                      'bands include only the noise.')
     part = slice(begin, samples.t.size)
+    # Codes of an ADC may have any offset.
+    lsb, code = samples.lsb, float(np.sort(samples.voltage)[samples.t.size // 2])
+
+    def read(v: FloatArray) -> FloatArray:
+        return np.asarray(code + lsb * np.rint((v - code) / lsb)) if lsb > 0.0 else v
+
     own = samples.part(part)
-    lsb = samples.lsb
-    yardstick = Yardstick(own, lsb, levels)
+    own = replace(own, voltage=read(own.voltage))
+    yardstick = Yardstick(own, lsb, levels, code)
     rng = np.random.default_rng(seed)
     shifts = np.zeros(seeds)
     stride = max(1, -(-own.t.size // _POINTS))
@@ -86,7 +92,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
             shifts[k] = (own.voltage[aligned] - v[aligned]).mean()
             v = v + shifts[k]
         total += v
-        v = lsb * np.rint(v / lsb) if lsb > 0.0 else v
+        v = read(v)
         first = v if k == 0 else first
         strays += stray(v, samples.voltage) > 0.0
         measured.append(yardstick.measure(v))

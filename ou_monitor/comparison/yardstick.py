@@ -215,13 +215,15 @@ class Measures:
 class Yardstick:
     """Levels, frequency bands and rises of a recording, by which voltages are compared."""
 
-    def __init__(self, samples: Readings, lsb: float, limits: tuple[float, ...] = ()) -> None:
-        # lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones.
+    def __init__(self, samples: Readings, lsb: float, limits: tuple[float, ...] = (),
+                 code: float = 0.0) -> None:
+        # lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones; code:
+        # one code of the ADC, V.
         v, t = samples.voltage, samples.t
         self._t = t
         self.minutes = float(t[-1] - t[0]) / 60.0
         low = [float(np.quantile(v, share)) for share in LOW_SHARES]
-        self.levels = [*limits, *(between_codes(level, lsb) for level in low)]
+        self.levels = [*limits, *(between_codes(level, lsb, code) for level in low)]
         u = np.full(t.size, NAN) if samples.throttle is None else samples.throttle
         flown = Recording(t, v, u, current=samples.current)
         left = remainder(flown)
@@ -265,9 +267,9 @@ class Yardstick:
         return np.asarray(responses.mean(axis=0), dtype=np.float64)
 
 
-def between_codes(level: float, lsb: float) -> float:
-    """Return the first midpoint between two codes above a level, V."""
-    return (np.floor(level / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
+def between_codes(level: float, lsb: float, code: float = 0.0) -> float:
+    """Return the midpoint above the code nearest below a level, V (code: any of them)."""
+    return code + (np.floor((level - code) / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
 
 
 def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64]:

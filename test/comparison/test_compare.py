@@ -257,6 +257,17 @@ def test_both_kinds_of_level_are_simulated_by_their_probability():
     assert len(kinds) / 300 == pytest.approx(0.3, abs=0.106)
 
 
+@pytest.mark.parametrize('offset', [0.0, 0.25, 0.5, 0.75])
+def test_a_coarse_adc_may_have_any_offset(offset):
+    """Codes of one deviation: counted from 0 they gave half as many dips, or twice as many."""
+    rail = SupplyModel((OU(20.0, 0.2, 15.0),))
+    t, step = np.arange(12000) / 100.0, 0.03
+    v = rail.simulate(t, np.random.default_rng(3))
+    found = compare(Recording(t, step * (np.rint(v / step - offset) + offset)), rail, seeds=20)
+    assert found.verdict is Likeness.LOOKS_LIKE_IT and found.apart.measured < found.apart.high
+    assert all(one.low / 1.2 < one.measured < 1.2 * one.high for one in found.dips)
+
+
 def test_held_samples_count_once():
     """A logger five times as fast as its source tells the same."""
     slow = flight(2, 800)

@@ -64,6 +64,7 @@ def test_white_noise_has_equal_power_in_equal_bands():
 def test_levels_lie_between_codes():
     assert between_codes(14.15, 0.01) == pytest.approx(14.155)
     assert between_codes(14.153, 0.0) == 14.153
+    assert between_codes(14.154, 0.01, 14.004) == pytest.approx(14.159)
     coarse = white(3)
     coarse = Readings(coarse.t, 0.1 * np.rint(coarse.voltage / 0.1), None)
     levels = Yardstick(coarse, 0.1).levels
