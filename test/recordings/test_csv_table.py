@@ -101,7 +101,7 @@ def test_a_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
 def test_a_binary_file_named_csv_is_refused(tmp_path):
     path = tmp_path / 'log.csv'
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match='not text'):
+    with pytest.raises(InputError, match='not a table'):
         read_recording(path)
     with pytest.raises(InputError, match='cannot read'):
         read_recording(tmp_path / 'no.csv')

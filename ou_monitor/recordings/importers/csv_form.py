@@ -155,8 +155,8 @@ def form_of(path: Path, wanted: CsvColumns, *, header: bool = False) -> Form:
     if best is None and not any(is_number(cell) for cell in re.split(r'[,;|"\s]+', text) if cell):
         raise InputError(f'{path} holds no numbers: expected rows of time and voltage')
     if best is None:
-        raise InputError(f'{path}: the header cannot be separated from the numbers: --delimiter, '
-                         '--decimal and --skip-rows say how it is written')
+        raise InputError(f'{path}: no table with a header was found: if there is one, '
+                         '--delimiter, --decimal and --skip-rows say how it is written')
     return best[1]
 
 
@@ -177,7 +177,7 @@ def _encoding(path: Path, head: bytes) -> str:
         raise InputError(f'{path}:{line}: the byte 0x{damage[0].hex()} is not text: the file is '
                          'damaged from there on')
     if nul or kind.startswith('it is') and kind != TEXT:
-        raise InputError(f'{path} is not text: {kind}')
+        raise InputError(f'{path} is not a table: {kind}')
     # A Chinese character takes two bytes; the µ and ° of an older Windows program take one.  Some
     # bytes of Japanese names do not exist in cp1252; Latin-1 has all bytes.
     runs = [len(run) for run in re.findall(rb'[\x80-\xff]+', head)]

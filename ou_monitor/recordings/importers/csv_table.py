@@ -29,7 +29,7 @@ from ou_monitor.recordings.importers.csv_cells import (
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.csv_units import (
-    Column, in_si, PULSE_WORDS, spread, stamps_of, unwrapped)
+    FileColumn, in_si, PULSE_WORDS, spread, stamps_of, unwrapped)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -110,9 +110,9 @@ class _Table(NamedTuple):
     """The data read from a file, in SI units."""
 
     form: Form
-    time: Column  # Without a place if rows name their series
+    time: FileColumn  # Without a place if rows name their series
     t: FloatArray
-    found: dict[str, tuple[Column, FloatArray]]  # By quantity
+    found: dict[str, tuple[FileColumn, FloatArray]]  # By quantity
     named: dict[str, FloatArray]  # Other requested columns, as written
     note: str  # How the file was read; '' if nothing was detected
 
@@ -302,7 +302,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     return _Table(form, time, even, scaled, dict(zip(others, values[len(found):])), note)
 
 
-def _rest_of_group(form: Form, quantity: str, column: Column, wanted: CsvColumns) -> list[int]:
+def _rest_of_group(form: Form, quantity: str, column: FileColumn, wanted: CsvColumns) -> list[int]:
     """Return the other columns of a group if the column is its first."""
     first = _FIRST_OF[quantity].fullmatch(column.name) if quantity in _FIRST_OF else None
     if first is None or quantity == logs.THROTTLE and wanted.throttle is not None:
@@ -379,10 +379,10 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
     return found
 
 
-def _time_of(path: Path, form: Form, wanted: CsvColumns) -> Column:
+def _time_of(path: Path, form: Form, wanted: CsvColumns) -> FileColumn:
     """Return the column of the time, or that rows are counted."""
     if wanted.sample_interval is not None:
-        return Column((), '--sample-interval', 's', wanted.sample_interval)
+        return FileColumn((), '--sample-interval', 's', wanted.sample_interval)
     if wanted.time is not None:
         return _unit_column(form, _column_place(path, form, wanted.time, '--time-column'),
                             wanted.time_unit)
@@ -401,8 +401,8 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> Column:
             return parts
         cells = form.cells(first)
         if beside and ':' in cells[0] and not has_day(cells[0]):
-            return Column((beside[0], first),
-                          f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
+            return FileColumn((beside[0], first),
+                              f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
     if 'sec' in form.names and (parts := _parts_of_second(form, form.names.index('sec'))):
         return parts
@@ -415,7 +415,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> Column:
             form, rising[0], wanted.time_unit)
     if not math.isfinite(form.step):
         raise InputError(_absent(path, form, TIME, ' (--time-column or --sample-interval)'))
-    return Column((), form.stated, 's', form.step)
+    return FileColumn((), form.stated, 's', form.step)
 
 
 def _finest(form: Form, first: int) -> int:
@@ -436,7 +436,7 @@ def _finest(form: Form, first: int) -> int:
         2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)), first)
 
 
-def _parts_of_second(form: Form, clock: int) -> Column | None:
+def _parts_of_second(form: Form, clock: int) -> FileColumn | None:
     """Return a time in whole seconds with the column of ms or ns beside it, if there is one."""
     cells = form.cells(clock)
     if all(map(str.isdigit, cells)):
@@ -447,7 +447,7 @@ def _parts_of_second(form: Form, clock: int) -> Column | None:
     else:
         return None
     most = 3 if unit == 'ms' else 9
-    return next((Column((clock, k), f'{form.names[clock]}, {form.names[k]}', unit, 0.0)
+    return next((FileColumn((clock, k), f'{form.names[clock]}, {form.names[k]}', unit, 0.0)
                  for k, name in enumerate(form.names[:form.width])
                  if k != clock and (k in rest or re.fullmatch(pattern, name.strip().lower()))
                  and all(k < len(row) and re.fullmatch(rf'0?\.\d+|\d{{1,{most}}}', row[k])
@@ -489,7 +489,7 @@ def _rises(form: Form, place: int) -> bool:
     return not (np.diff(_times(form, place)) < 0.0).any()
 
 
-def _unit_column(form: Form, place: int, unit: str | None) -> Column:
+def _unit_column(form: Form, place: int, unit: str | None) -> FileColumn:
     name, stated = form.names[place], form.units[place]
     end = re.split('[./:]', name.strip().lower())[-1]
     raw = next((units[end] for column, units in _RAW.items()
@@ -497,8 +497,8 @@ def _unit_column(form: Form, place: int, unit: str | None) -> Column:
     if raw and raw[1].startswith(unit or '') and not (stated and unit is None):
         if end == 'vbatlatest' and re.search(r'Betaflight 3\.[1-9]|Cleanflight [2-9]', form.above):
             raw = 0.1, '0.1 V', math.nan
-        return Column((place,), name, raw[1], raw[0], raw[2])
-    return Column((place,), name, unit or stated, 0.0)
+        return FileColumn((place,), name, raw[1], raw[0], raw[2])
+    return FileColumn((place,), name, unit or stated, 0.0)
 
 
 def _stem(name: str) -> str:
@@ -507,8 +507,8 @@ def _stem(name: str) -> str:
         name)[0].lower())
 
 
-def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: Column, needed: bool,
-               ) -> dict[str, Column]:
+def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, needed: bool,
+               ) -> dict[str, FileColumn]:
     """Return the columns of voltage, throttle and current that exist."""
     names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
              logs.THROTTLE: (wanted.throttle, '--throttle-column', wanted.throttle_unit),
@@ -517,7 +517,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: Column, needed:
              if (place := _place_of(form, name)) is not None]
     taken = [*time.place, *given]
     currents = {_stem(form.names[k]) for k in _choose(form, logs.CURRENT, taken)}
-    found: dict[str, Column] = {}
+    found: dict[str, FileColumn] = {}
     for quantity, (name, option, unit) in names.items():
         if name == NONE and quantity != logs.VOLTAGE:
             continue
@@ -565,7 +565,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: Column, needed:
     return found
 
 
-def _series_of(path: Path, form: Form, wanted: CsvColumns, time: Column,
+def _series_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn,
                ) -> tuple[Form, int, int] | None:
     """Return the form of the series that rows name, and the columns of their names and values."""
     named = _choose(form, logs.VOLTAGE, time.place)
@@ -591,7 +591,7 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: Column,
     return None
 
 
-def _read(path: Path, form: Form, time: Column, places: list[int],
+def _read(path: Path, form: Form, time: FileColumn, places: list[int],
           left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
           only: tuple[int, frozenset[str]] | None = None) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
@@ -653,7 +653,7 @@ def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
     return cells if len(cells) == size else []
 
 
-def _read_note(form: Form, time: Column, found: dict[str, Column], units: dict[str, str],
+def _read_note(form: Form, time: FileColumn, found: dict[str, FileColumn], units: dict[str, str],
                wanted: CsvColumns) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     encoding = '' if form.encoding in ('utf-8', 'utf-8-sig') else f', {form.encoding}'

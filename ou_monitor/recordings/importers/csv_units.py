@@ -46,7 +46,7 @@ _MOST_VOLTS = 1000.0
 _LEAST_PERCENT = 5.5
 
 
-class Column(NamedTuple):
+class FileColumn(NamedTuple):
     """A selected column."""
 
     place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
@@ -84,7 +84,7 @@ def _of_day(t: FloatArray) -> FloatArray | None:
     return seconds if abs(np.median(over) - usual) <= 0.5 * usual else None
 
 
-def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: Column,
+def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: FileColumn,
               ) -> tuple[FloatArray, str]:
     """Return the time in s, and its unit in words."""
     if not time.place:
@@ -158,7 +158,7 @@ def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
         np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
 
 
-def in_si(quantity: str, column: Column, values: FloatArray, given: str | None,
+def in_si(quantity: str, column: FileColumn, values: FloatArray, given: str | None,
           volts: FloatArray, beside: str) -> tuple[FloatArray, str]:
     """Return values in V, 0..1 or A, and their unit in words (beside: the voltage's unit)."""
     known = np.abs(values[np.isfinite(values)])

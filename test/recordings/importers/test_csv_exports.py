@@ -1036,11 +1036,11 @@ def test_options_of_the_command_line(tmp_path, capsys):
     (b'PK\x03\x04' + bytes(50), 'workbook of Excel'), (b'<!DOCTYPE html><html>\n', 'a web page'),
     (b'<SALEAE>' + bytes(50), 'export it as CSV'), (b'SQLite format 3\0', 'ros2 bag convert'),
     (b'\x1f\x8b\x08\0' + bytes(50), 'gunzip'), (b'{"t": [0, 1]}\n', 'JSON'),
-    (b'\x7fELF' + bytes(50), 'is not text')])
+    (b'\x7fELF' + bytes(50), 'is not a table')])
 def test_a_file_of_another_kind_is_named(content, words, tmp_path):
     """Whatever its name ends in; a log of an autopilot in a .csv is read as the log it is."""
     for name in ('a.csv', 'a'):
-        if (name, words) == ('a', 'is not text'):
+        if (name, words) == ('a', 'is not a table'):
             words = 'first bytes are'
         with pytest.raises(InputError, match=words):
             read_recording(written(tmp_path, content, name))
