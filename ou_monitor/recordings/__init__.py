@@ -1,1 +1,1 @@
-"""Read and write recordings (MCAP bags, CSV, logs of autopilots) and model files."""
+"""Read and write recordings (MCAP bags, CSV, autopilot logs) and model files."""

@@ -1,5 +1,5 @@
 """
-Bags: an .mcap file, or a rosbag2 directory of several with its `metadata.yaml`.
+Read and write bags: an .mcap file, or a rosbag2 directory of .mcap files and `metadata.yaml`.
 
 `BagReader` reads single messages in the order of log times, with only those chunks in memory that
 overlap in time; `read_fields` reads fields of topics as arrays.  A truncated or damaged bag is
@@ -80,7 +80,7 @@ def is_part(file: Path, folder: Path) -> bool:
 
 
 def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, str], str]:
-    """Return the files of a bag, as recorded, its custom data, and what is missing ('': none)."""
+    """Return the files of a bag as recorded, its custom data, and what is missing; '': nothing."""
     if path.name == FILE and path.is_file():
         path = path.parent
     if not path.exists():
@@ -139,10 +139,10 @@ class BagReader:
     Reads a bag (.mcap file or rosbag2 directory); with `partial` also a damaged one.
 
     By topic: `topics` has the message type, `counts` the number of messages, `sample_rates` the
-    rate of samples within blocks, Hz, if stated.  `about` is the custom data of metadata.yaml or
-    of the files; `start_ns`, `end_ns` are the log times of the first and last message; `damage` is
-    the place and kind of damage, or None; `notes` tell what was left out.
-    InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
+    rate of samples within blocks, Hz, if stated. `about` is the custom data of metadata.yaml or of
+    the files; `start_ns`, `end_ns` are the log times of the first and last message; `damage` is
+    the place and kind of damage, or None; `notes` list what was left out. Raises InputError if the
+    bag is missing, empty, of another format, without messages, or damaged and not `partial`.
     """
 
     def __init__(self, path: Path | str, *, partial: bool = False) -> None:
@@ -265,8 +265,9 @@ def read_fields(
     """
     Return fields of a bag in the order of log times, at least to `end_ns`, ns.
 
-    `beside` names a second field to read from the same messages.  `broken` gets an item for each
-    message that cannot be decoded, the first its reason; if it is None, this raises InputError.
+    `beside` names a second field to read from the same messages. For each message that cannot be
+    decoded, `broken` gets an item, of which the first states the reason; if `broken` is None, such
+    a message raises InputError.
     """
     def reader_of(spec: FieldSpec, second: FieldSpec | None) -> FieldReader:
         def refuse(log_time: int, why: str) -> None:
@@ -308,9 +309,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
     """
     Writes a bag: an .mcap file when the path ends in .mcap, else a rosbag2 directory.
 
-    A context manager; after an exception in its block the files are removed.
-    `about`, where the data came from, is kept in a metadata record of the file, and in the custom
-    data of metadata.yaml.  InputError: the target exists, its folder does not, or it cannot be
+    A context manager; after an exception in its block the files are removed. `about`, where the
+    data came from, is kept in a metadata record of the file, and in the custom data of
+    metadata.yaml. Raises InputError if the target exists, its folder does not, or it cannot be
     written.
     """
 

@@ -2,8 +2,8 @@
 The voltage samples of a bag with their throttle and current.
 
 A msg config fits by name if the bag has its topic (or one ending with it, as in a namespace) with
-its type; a generic one also fits by type if only one topic has that type.  If several fit, the
-user must choose.  Limits: the samples of a bag are in memory at once: 150 MB for an hour at 1 kHz.
+its type; a generic one also fits by type if only one topic has that type. If several fit, the user
+must choose. Limits: all samples of a bag are held in memory, 150 MB for an hour at 1 kHz.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def _throttle(
     spec = config.throttle
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
-        # Read a topic named by the user as the first of these with its type does.
+        # Read a topic that the user names by the first of these specs that has its type.
         for one in (spec, *(c.throttle for c in list_msg_configs().values()),
                     FieldSpec(topic, FLOAT64, 'data')):
             if one is not None and one.type == topics[topic]:
@@ -193,7 +193,7 @@ def read_bag(
     broken: list[str] = []
     first = 0 if start is None else _limit(bag, start)
     last = None if end is None else _limit(bag, end)
-    # A current in the messages of the voltage belongs to the same message's voltage.
+    # A current in the same messages as the voltage is paired with it message by message.
     own = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
     beside = {VOLTAGE: specs.pop(CURRENT)} if own else {}
     columns = read_fields(bag, specs, end_ns=last, progress=progress, beside=beside,
@@ -232,7 +232,7 @@ def read_bag(
     volts, current = supply.values, None
     if np.isfinite(supply.beside).any():
         current = np.repeat(supply.beside, supply.counts)
-    # An hour at 1 kHz: 30 MB of log times are not needed any more.
+    # Free memory: the log times alone take 30 MB for an hour at 1 kHz.
     del columns, supply, log_time
     if CURRENT in holds:
         current = holds[CURRENT].at(t)
@@ -244,8 +244,8 @@ def read_bag(
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
              ends: FloatArray, own: npt.NDArray[np.bool_], sample_rate: float | None,
              ) -> tuple[ThrottleHold, int]:
-    """Return a throttle or current to pair with voltages (ends in s), and a count of NaN."""
-    # Of the values before the part, which starts at `first`, ns, only the last one is needed.
+    """Return throttle or current held over voltage blocks (ends in s), and a count of NaN."""
+    # Of the values before `first`, ns, where the part starts, only the last known one is needed.
     known = np.flatnonzero(np.isfinite(column.values[:column.place(first)]))
     _, column = column.split(int(known[-1]) if known.size else 0)
     usable, unknown = np.isfinite(column.stamp), 0

@@ -1,9 +1,9 @@
 """
-CDR messages as arrays: the layout of one message, verified in all others.
+Read fields of many CDR messages as arrays, by layouts that are learned from single messages.
 
-CDR has no fixed offsets: a text or a sequence shifts all that follows. But in a recording the same
-texts and lengths recur. So a message is walked once, by the definition of its type, and its layout
-holds for all messages of the same size with the same length words: their fields are columns. A
+CDR has no fixed offsets, because the length of a text or a sequence shifts everything after it.
+But in a recording the same lengths recur. So a message is walked once, by the definition of its
+type, and its layout is used for all messages of the same size with the same length words. A
 message with a new layout is walked by itself; one that does not fit its type is refused.
 
 Plain CDR version 1 (OMG DDS-XTypes 7.4.3): alignment is counted from after the 4-byte header.
@@ -40,7 +40,8 @@ Rows = npt.NDArray[np.uint8]
 # Representation identifier and options.
 _HEADER = 4
 
-# Limits of a walk: steps beyond 4 per byte (few bytes may state 2^32 empty elements), and depth.
+# Limits of a walk: number of steps beyond 4 per byte (few bytes may state 2^32 empty elements),
+# and depth.
 _FREE_STEPS, _MOST_DEPTH = 1000, 50
 # Maximum number of layouts kept for messages of one size, and of length words in a kept layout; a
 # topic with more has no recurring layout.
@@ -55,7 +56,7 @@ class Field:
     # A key of `PRIMITIVES`, `TEXT`, or 'package/Type'.
     type: str  # noqa: A003
     array: bool = False
-    size: int | None = None  # Elements of an array of fixed size; None when a message states them
+    size: int | None = None  # Length of a fixed-size array; None if each message states it
 
 
 # package/Type -> its fields.
@@ -74,7 +75,7 @@ def short_name(kind: str) -> str:
 
 
 def _find(spec: FieldSpec, text: str, definitions: Definitions) -> tuple[FieldPath, Field]:
-    """Return a path, and the field at its end; an element of an array is not an array."""
+    """Parse a path; return it and the field at its end."""
     path, at = parse_field_path(text), Field('', short_name(spec.type))
     for step in path:
         if isinstance(step, int):
@@ -92,7 +93,7 @@ def _find(spec: FieldSpec, text: str, definitions: Definitions) -> tuple[FieldPa
 
 
 def value_path(spec: FieldSpec, definitions: Definitions) -> FieldPath:
-    """Return the path of a number, or of an array of them where the spec has a sample rate."""
+    """Return the path of a number, or, if the spec has a sample rate, of an array of numbers."""
     path, found = _find(spec, spec.field, definitions)
     if found.type not in PRIMITIVES:
         raise InputError(f"field '{spec.field}' of {spec.type} holds a {found.type}, not a "
@@ -105,7 +106,7 @@ def value_path(spec: FieldSpec, definitions: Definitions) -> FieldPath:
 
 
 def stamp_paths(spec: FieldSpec, definitions: Definitions) -> tuple[FieldPath, ...]:
-    """Return the paths of a stamp: of seconds and nanoseconds, of a number, or none."""
+    """Return the paths of a stamp: of seconds and nanoseconds, of one number, or none."""
     if spec.stamp_field is None:
         return ()
     path, found = _find(spec, spec.stamp_field, definitions)
@@ -147,16 +148,16 @@ class Place:
 
 
 class Layout:
-    """The layout of one message, walked from front to back; ValueError: not of its type."""
+    """The layout of one message, walked front to back; ValueError if it does not fit its type."""
 
     def __init__(self, data: bytes, kind: str, definitions: Definitions,
                  wanted: frozenset[FieldPath]) -> None:
         if len(data) < _HEADER or data[0] != 0 or data[1] > 1:
-            # Other encodings align otherwise.
+            # Other encodings have another alignment.
             raise ValueError('it is not plain CDR')
         # (offset, value) of every uint32 that states a length.
         self.words: list[tuple[int, int]] = []
-        # (offset, bytes) of every text, its closing zero left out.
+        # (offset, bytes) of every text, without its closing zero.
         self.texts: list[tuple[int, int]] = []
         # Places of the wanted fields, except elements beyond the end of their array.
         self.places: dict[FieldPath, Place] = {}
@@ -287,7 +288,7 @@ class MessageTable:
 
 
 def joined(tables: Sequence[MessageTable]) -> MessageTable:
-    """Return the messages of tables, one or more, one after another."""
+    """Concatenate one or more tables."""
     if len(tables) == 1:
         return tables[0]
     begins = np.cumsum([0, *(len(table.data) for table in tables[:-1])])
@@ -300,7 +301,7 @@ def joined(tables: Sequence[MessageTable]) -> MessageTable:
 
 
 def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
-    """Return items of a kind from anywhere in a block of bytes."""
+    """Return the items of NumPy type `kind` at offsets `at` of a block of bytes."""
     size = np.dtype(kind).itemsize
     if not at.size:
         return np.empty(0, kind)
@@ -343,7 +344,7 @@ class FieldColumn(NamedTuple):
                 FieldColumn._make(column[k:] for column, k in zip(self, cut)))
 
     def place(self, log_time: int) -> int:
-        """Return how many of the messages, in order, are before a log time, ns."""
+        """Return the number of messages, which are in time order, before a log time, ns."""
         return int(np.searchsorted(self.log_time, np.uint64(log_time), 'left'))
 
     def in_time_order(self) -> FieldColumn:
@@ -358,12 +359,12 @@ _NO_MESSAGE = FieldColumn(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bo
 
 
 def joined_columns(parts: list[FieldColumn]) -> FieldColumn:
-    """Join parts, and empty their list: parts and whole would take twice the memory."""
+    """Join parts; their list is emptied, because parts and whole would take twice the memory."""
     columns: list[Any] = [list(pieces) for pieces in zip(_NO_MESSAGE, *parts)]
     parts.clear()
     for k, (_, *pieces) in enumerate(columns):
         if pieces and not any(piece.strides[0] for piece in pieces):
-            # Views of one value: so is the whole.
+            # All parts are views of one value, so the whole is one, too.
             columns[k] = np.broadcast_to(pieces[0][0], sum(piece.size for piece in pieces))
         else:
             columns[k] = np.concatenate(columns[k])
@@ -371,7 +372,7 @@ def joined_columns(parts: list[FieldColumn]) -> FieldColumn:
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
-    """Return ns as s; whole seconds separately: ns since 1970 exceed a float64's precision."""
+    """Convert ns to s, whole seconds separately: ns since 1970 exceed a float64's precision."""
     whole, rest = np.divmod(log_time, np.uint64(1_000_000_000))
     return whole + rest * 1e-9
 
@@ -384,7 +385,7 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
 
 
 class ZeroRule:
-    """Turns zeros that mean "not measured" into NaN, by a msg_config's `zero`."""
+    """Turns zeros that mean "not measured" into NaN, according to `zero` of a msg config."""
 
     def __init__(self, rule: str) -> None:
         self._rule = rule
@@ -406,9 +407,10 @@ class FieldReader:
     """
     Reads one field, and its stamp, of messages of one type.
 
-    `beside` is a second field, of one number in each message.  The `nan` rules are not applied: a
-    missing or non-finite value is NaN.  Messages that do not fit their type are left out
-    after a call of `broken`.  InputError: the type has no such field, or it is not a number.
+    `beside` is a second field, of one number in each message. The `nan` rules are not applied: a
+    missing or non-finite value is NaN. A message that does not fit its type is reported to
+    `broken` and left out. Raises InputError if the type has no such field, or the field is not a
+    number.
     """
 
     def __init__(self, spec: FieldSpec, definitions: Definitions, broken: Broken,
@@ -466,7 +468,7 @@ class FieldReader:
 
     def _groups(self, table: MessageTable, refused: dict[int, str],
                 ) -> Iterator[tuple[IntArray, Rows, Layout]]:
-        """Yield indices, rows and layout of messages of one layout; note why others do not fit."""
+        """Yield messages by layout (indices, rows, layout); note why others do not fit."""
         lengths = table.end - table.begin
         for length in np.unique(lengths).tolist():
             left = np.nonzero(lengths == length)[0]

@@ -1,5 +1,5 @@
 """
-One .mcap file, read by the MCAP library: topics, places of their messages, and damage.
+Index one .mcap file with the MCAP library: topics, places of their messages, and damage.
 
 The file is walked record by record.  Chunks that an intact summary lists are unpacked later, when
 their messages are read; all others, and all chunks with `partial`, are unpacked during the walk.
@@ -71,8 +71,8 @@ MOST_BYTES, MOST_NODES = 8_000_000, 200_000
 _MOST_METADATA, _MOST_TABLES = 10_000_000, 3
 # Maximum size of a definition (usual: some kB) and of a name (DDS: 256 characters).
 _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
-# Maximum number of damages before the walk ends, of left-out topics that are named, and of records
-# in a chunk that are not messages (one schema and one channel for each number).
+# Maximum number of damaged places before the walk ends, of left-out topics that are named, and of
+# records in a chunk that are not messages (one schema and one channel for each number).
 _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
 # Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024
@@ -116,7 +116,7 @@ def usable_memory() -> int:
     """Return the smallest memory limit of machine, control group and process, bytes."""
     limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
     for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
-        # Missing, or the word "max".
+        # The file may be missing, or hold the word "max".
         with suppress(OSError, ValueError):
             limits.append(int(Path(file).read_text(encoding='ascii')))
     allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -143,9 +143,9 @@ class McapFile:
     """
     One .mcap file, its `topics` by channel, `counts` of messages, `spans` that hold them.
 
-    `partial`: walk the whole file.  `about` is the file's own metadata, `start_ns` and `end_ns`
-    the log times of the first and last message, `origin_ns` the log time of the bag's first
-    message.  InputError: missing, empty or foreign.
+    `partial`: walk the whole file. `about` is the file's own metadata, `start_ns` and `end_ns` the
+    log times of the first and last message, `origin_ns` the log time of the bag's first message.
+    Raises InputError if the file is missing, empty or not MCAP.
     """
 
     def __init__(self, path: Path, partial: bool) -> None:
@@ -165,7 +165,7 @@ class McapFile:
         self._unpacked = self._tables = self._metadata = 0
         # Whether the summary counts the messages and lists the chunks, which are read later.
         self._trusted = False
-        # Shared, because creating one takes as long as unpacking a small chunk.
+        # One for all chunks, because creating it takes as long as unpacking a small chunk.
         self._zstd = zstandard.ZstdDecompressor()
         with opened(self.path) as file:
             self._size = file.seek(0, os.SEEK_END)
@@ -358,7 +358,7 @@ class McapFile:
             self._add_channel(found)
 
     def _learn_about(self, file: BinaryIO, length: int) -> None:
-        """Read the metadata record whose head was just read; the first broken one is noted."""
+        """Read the metadata record whose head was just read; note the first unreadable one."""
         try:
             self._metadata += length
             if self._metadata > 2 * _MOST_METADATA:
@@ -497,7 +497,7 @@ class McapFile:
         return _table(data, places)
 
     def channels_of(self, wanted: set[str]) -> dict[int, str]:
-        """Return channel -> topic of some topics."""
+        """Return the wanted topics by channel."""
         return {key: topic.name for key, topic in self.topics.items() if topic.name in wanted}
 
     def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, MessageTable]:
@@ -652,7 +652,7 @@ def _records(data: bytes, at: int = 0, *, end: int | None = None, messages_only:
 
 
 def _by_index(data: bytes, index: bytes) -> tuple[IntArray, Others, int] | None:
-    """Return the records of a chunk as `_records`; None if its indexes do not describe them."""
+    """Return a chunk's records as `_records` does; None if its indexes do not describe them."""
     # Messages in the indexes and records of other kinds must fill the chunk from end to end.
     parts, at = [np.empty(0, np.int64)], 0
     while at < len(index):

@@ -44,7 +44,7 @@ class ModelFile:
 
 @one_line()
 def read_model(path: str | Path) -> ModelFile:
-    """Read a model file; the largest, 1 MB, takes 2 to 5 s, so a node needs a thread for it."""
+    """Read a model file; the largest, 1 MB, takes 2 to 5 s, so a node reads it in a thread."""
     return parse_model(read_yaml(path, 'the model file'), path_words(path))
 
 

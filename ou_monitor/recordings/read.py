@@ -28,7 +28,7 @@ from ou_monitor.timeline import (
     check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
     readings_of)
 
-# Spacing, s, from which another unit of time is more likely than a slow logger.
+# Spacing, s, above which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
 
 
@@ -53,8 +53,8 @@ def read_recording(
         Whether to read the intact part of a damaged bag, or a CSV without its bad lines, with a
         note.
     start, end : float, optional
-        Part to read, s after the first message of the bag (by log time) or the first sample of
-        the CSV or log: start <= t < end.  The last throttle before the part holds in it.
+        Part to read, s after the first message of the bag (by log time) or the first sample of the
+        CSV or log: start <= t < end. The last throttle before the part is held into it.
     flight : int, optional
         Flight of a log with several, from 1; default: the largest.
     columns : CsvColumns, optional
@@ -93,7 +93,7 @@ def _read(
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
     **of_bags: Any,
 ) -> tuple[Recording, Log | None]:
-    """Read a recording, repeats included; of a log, return also the `Log`, with `signal`."""
+    """Read a recording with its repeats; for a log, also return the `Log` with `signal`."""
     _check_part(start, end)
     kind = kind_of(path)
     csv, log = kind == CSV, kind not in (CSV, BAG)

@@ -31,7 +31,7 @@ FLOAT64 = 'std_msgs/msg/Float64'
 FLOAT32_ARRAY = 'std_msgs/msg/Float32MultiArray'
 BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 
-# rosbag2 prints this line between a definition and the definitions it uses.
+# rosbag2 writes this line between a definition and the definitions it uses.
 _SEPARATOR = 80 * '='
 _STD_HEADER = f"""\
 {_SEPARATOR}
@@ -182,7 +182,7 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
 
 
 def encode_imu(stamps_ns: npt.NDArray[np.int64], values: npt.NDArray[np.float64]) -> list[bytes]:
-    """Return one Imu per stamp, ns, in `base_link` (rad/s, shape (n, 3); m/s^2 beside it)."""
+    """Return one Imu per stamp, ns, in `base_link` (rad/s, (n, 3); with m/s^2, (n, 6))."""
     vectors = dict(zip(('angular_velocity', 'linear_acceleration'),
                        np.hsplit(values, values.shape[1] // 3)))
     # By the message definition -1 means not measured, and 0 an unknown covariance.

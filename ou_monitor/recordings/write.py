@@ -1,11 +1,11 @@
 """
 Write a `Recording`, or the series of a log, as a bag.
 
-`replay`, `ros2 bag play` and `analyze` read it.  Limits: messages hold float32 (except
+`replay`, `ros2 bag play` and `analyze` read such bags. Limits: messages hold float32 (except
 std_msgs/Float64), which resolves 0.5 uV at 5 V.
 
-Every series of a log keeps its own stamps, counted from the start of the log, within 10 ns over
-a day.  Gyros are sensor_msgs/Imu, motor speeds sensor_msgs/JointState (velocity, rad/s), named
+Every series of a log keeps its own stamps, counted from the start of the log, to within 10 ns over
+a day. Gyros are sensor_msgs/Imu, motor speeds sensor_msgs/JointState (velocity, rad/s), named
 series std_msgs/Float64; the metadata of the bag have their units.
 """
 
@@ -27,7 +27,7 @@ from ou_monitor.recordings.standard_types import (
     FLOAT32, FLOAT32_ARRAY, FLOAT64, IMU, JOINT_STATE)
 from ou_monitor.records import FloatArray, Recording
 
-# Names of `type` -> message type of the voltage.
+# Value of `type` -> message type of the voltage.
 TYPES = {
     'battery_state': BATTERY_STATE, 'float32': FLOAT32, 'float64': FLOAT64,
     'adc_block': FLOAT32_ARRAY,

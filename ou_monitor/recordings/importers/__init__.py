@@ -1,1 +1,1 @@
-"""Read CSV and autopilot logs, one module per format -> series of voltage, throttle, current."""
+"""Read CSV and autopilot logs as series of voltage, throttle, current; one module per format."""

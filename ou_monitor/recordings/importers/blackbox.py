@@ -1,5 +1,5 @@
 """
-Betaflight and INAV blackbox, read by orangebox.
+Read Betaflight and INAV blackbox logs, with orangebox.
 
 Limits: the ADC is read more slowly than the log is written, so most voltages are repeats.  After a
 damaged frame, frames are left out up to the next key frame.  orangebox is under GPL-3; importers
@@ -36,7 +36,7 @@ WRAP = 2**32
 
 # Maximum step between frames, s; a longer one is a pause of the log.
 _PAUSE = 10.0
-# Minimum frames after a step in time; fewer are corrupt bytes, not flight.
+# Minimum number of frames after a jump of the time; fewer are corrupt bytes, not flight.
 _PART = 16
 
 GYRO, UNFILTERED, DEBUG, ACCELEROMETER = 'gyroADC', 'gyroUnfilt', 'debug', 'accSmooth'
@@ -155,7 +155,7 @@ def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArra
 
 
 def _in_time(table: FloatArray) -> tuple[FloatArray, int]:
-    """Return the frames in the order of an unwrapped time, and the number that did not fit."""
+    """Return the frames in order of unwrapped time, and the number of frames dropped."""
     if len(table) < 2:
         return table, 0
     time = np.unwrap(np.mod(table[:, 0], WRAP), period=WRAP)
@@ -178,7 +178,7 @@ def _facts(headers: Headers) -> dict[str, str]:
     for fact, key in (('firmware', 'Firmware revision'), ('vehicle', 'Craft name'),
                       ('board', 'Board information'), ('started', 'Log start datetime')):
         value = headers.get(key)
-        # Without a clock the date is in the year 0.
+        # If the autopilot has no clock, the date is in the year 0.
         if value not in (None, '') and not str(value).startswith('0000-'):
             facts[fact] = str(value)
     return facts | _cells(headers)
@@ -373,7 +373,8 @@ def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
         notes.append('eRPM was left out: the header does not state motor_poles; give --poles N, '
                      'the magnets of a rotor (14 is common).')
         return None
-    # eRPM is logged in hundreds; each pair of poles makes one electrical turn per turn.
+    # eRPM is logged in hundreds; each pair of poles makes one electrical turn per turn of the
+    # shaft.
     scale = 100.0 * RPM * 2.0 / count
     origin = '--poles' if poles else 'the header'
     return speeds_of(t, [columns[f'eRPM[{k}]'] for k in places], scale, 'eRPM',

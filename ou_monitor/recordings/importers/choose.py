@@ -1,9 +1,9 @@
 """
-Selection from a log: voltage, throttle, current, gyros, speeds, named series.
+Choose voltage, throttle, current, gyro, motor speeds and named series from a log.
 
-The default is the battery, never a rail behind a regulator; if there are
-several batteries, the user must choose.  The default throttle has the smallest
-rank: motor outputs before stick commands.
+The default voltage is the battery's, never a rail behind a regulator; if there are several
+batteries, the user must choose. The default throttle has the smallest rank: motor outputs before
+stick commands.
 
 Rows of gyro and accelerometer with a non-finite number are dropped whole.
 """
@@ -43,13 +43,13 @@ class ChosenSeries:
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
            current: str | None = None, option: str = '--{}') -> ChosenSeries:
-    """Choose series, drop unusable samples (option: name of a quantity's option, for errors)."""
+    """Choose series, drop unusable samples (option: pattern of option names, for errors)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
         raise InputError(_no_voltage(path, log, option))
     first = _pick(path, log, THROTTLE, throttle, option)
     if first is not None and log.format == 'csv':
-        # Importers of autopilot logs know the scale; a column does not state it.
+        # The scale of a CSV column is not stated; importers of autopilot logs know theirs.
         check_throttle(f'{path}: {first.name}', first.values)
     if current is not None:
         second = _pick(path, log, CURRENT, current, option)
@@ -193,7 +193,7 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
 
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
-# Number of parts of a series whose rates are compared; ratio of rates above which this is noted.
+# Number of parts of a series whose rates are compared; ratio of rates above which a note is given.
 _PARTS, _UNEQUAL = 10, 1.5
 # Minimum length of a gap, in typical steps.
 _GAP = 3.0
@@ -201,7 +201,7 @@ _GAP = 3.0
 
 def choose_extras(path: Path, log: Log, *, imu: str | None = None, signals: Sequence[str] = (),
                   ) -> tuple[dict[str, Series], tuple[str, ...]]:
-    """Return, by topic, the named or the default gyro, the speeds and the named series; notes."""
+    """Return gyro (imu: its name), motor speeds and named series, by topic, and notes."""
     notes: list[str] = []
     found: dict[str, Series] = {}
     gyro = _gyro(path, log, imu)
@@ -274,7 +274,7 @@ def _unused_topic(topic: str, taken: set[str]) -> str:
 
 
 def _gyro(path: Path, log: Log, name: str | None) -> Series | None:
-    """Return the gyro of a name; None: the default, if there is one."""
+    """Return the gyro with this name; without a name, the default, if there is one."""
     if name is None or name == NONE:
         return None if name else default_gyro(log)
     known = [one.name for one in log.inertial]

@@ -1,9 +1,9 @@
 """
-Crazyflie logs of the micro-SD deck, read without a library.
+Read Crazyflie logs of the micro-SD deck, without a library.
 
-Limits: the battery is read at 100 Hz or less, so a faster log repeats it.  The format has
-one checksum over the whole file: a mismatch does not locate the wrong bytes, and a
-note reports it.  The firmware's own events are used only if named.
+Limits: the battery is read at 100 Hz or less, so a faster log repeats it. The format has one
+checksum over the whole file, so a mismatch, which a note reports, does not locate the wrong bytes.
+Events other than `fixedFrequency` are used only if named.
 
 As written by bitcraze/crazyflie-firmware (src/deck/drivers/src/usddeck.c; decoded by
 tools/usdlog/cfusdlog.py), little-endian: byte 0xBC, version and number of events (2 x uint16);

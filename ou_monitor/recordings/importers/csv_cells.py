@@ -1,8 +1,8 @@
 """
 Read one cell or name of a table of text: numbers, units, dates and times.
 
-A number may be followed by its unit; words of loggers for a missing number are known.  Dates and
-times are those of loggers and spreadsheets of several countries.
+A number may be followed by its unit, and loggers' words for a missing number are recognised. Dates
+and times may have the formats of loggers and spreadsheets of several countries.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ou_monitor.text import plain_number
 # Words of loggers for a missing number, or for one beyond the range.
 _MISSING = frozenset('nan,null,none,na,n/a,#n/a,x,∞,-∞,ol,-ol,ovl,overload,'
                      'unavailable,unknown,1.#qnan,-1.#qnan,-1.#ind,1.#inf,-1.#inf'.split(','))
-# Maximum characters of a cell that are shown.
+# Maximum number of characters of a cell in a message.
 _LONGEST = 40
 
 
 def _by_word(**units: str) -> dict[str, str]:
-    """Return a table of the words for units, in lower case -> unit."""
+    """Return a table from words for units, in lower case, to the unit."""
     return {word: unit for unit, words in units.items() for word in words.split()}
 
 
@@ -51,17 +51,17 @@ WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
 SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
           'mV': 1e-3, 'kV': 1e3, 'uV': 1e-6, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3,
           'uA': 1e-6, '%': 0.01}
-# A name that ends with one of these words, preferably in brackets.  Repetitions after the quantity
-# are bounded, so that the time is proportional to the length of a name.
+# A name that ends with a unit, preferably in brackets. Repetitions after the quantity are bounded,
+# so that matching takes time proportional to the length of the name.
 _WORD = rf"({'|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True))})(?: dc)?"
 _WITH_UNIT = re.compile(
     rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
     r'(.*(?:time|stamp))([mun]s)|'  # ArduPilot's TimeUS
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
-    rf'(.+?)[ _](?!adc){_WORD}')  # Raw_ADC is no current
+    rf'(.+?)[ _](?!adc){_WORD}')  # Raw_ADC is not a current
 # A unit before more words: 101 (VDC)- Battery.
 _BEFORE = re.compile(rf'(.*?)( ?[\[(]{_WORD}[\])]) ?[-:] ?(\w.*)', re.IGNORECASE)
-# Volts*100; current (10 mA).
+# A multiple of a unit: Volts*100; current (10 mA).
 _MULTIPLE = re.compile(
     r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(?:x ?)?(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))', re.IGNORECASE)
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')  # 12.3 mV DC
@@ -95,7 +95,7 @@ def number_of(cell: str) -> tuple[float, str]:
 
 
 def is_missing(cell: str) -> bool:
-    """Return whether a cell says that there is no number: blank, a word, or dashes (--.--)."""
+    """Return whether a cell stands for a missing number: blank, a word, or dashes (--.--)."""
     return not cell.strip(' \t\n-.') or cell.strip().lower() in _MISSING
 
 
@@ -165,7 +165,7 @@ def unit_word(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    """Return the part that fits in one line: an open quote makes the rest of a file one cell."""
+    """Shorten a cell to one line: an unclosed quote makes the rest of a file one cell."""
     shown = text.strip()
     return shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '...'
 
@@ -189,7 +189,8 @@ def clock_times(path: Path, cells: list[str], name: str, left_out: list[str] | N
         raise InputError(f"{path}: column '{name}': {error}") from error
     spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
              for t in either]
-    # 10.22.31 is no date, and dates alone are no stamps: Italians write a time with dots between.
+    # Italians write times with dots. Try that if the cells are not valid dates (10.22.31), or are
+    # dates without a time of day.
     dotted = [re.sub(r'^(\d\d?)[.,]([0-5]\d)[.,]([0-5]\d)(?!\d)', r'\1:\2:\3', cell)
               for cell in cells]
     if dotted != cells and (min(spans) == math.inf or not any(one and one[8] for one in found)
@@ -197,10 +198,10 @@ def clock_times(path: Path, cells: list[str], name: str, left_out: list[str] | N
         t = clock_times(path, dotted, name, left_out)
         if min(spans) == math.inf or np.abs(np.diff(t)).mean() <= LONGEST_STEP:
             return t
-    # In 04/05 either may be the day: choose the shorter recording.
+    # In 04/05 either number may be the day: choose what gives the shorter recording.
     t = either[0] if spans[0] <= spans[1] else either[1]
     if any(one is not None and not (one[1] or one[4]) for one in found):
-        # Minutes and seconds alone start anew each hour.
+        # Times without a date start anew each day; minutes and seconds alone, each hour.
         turn = _DAY if not np.nanmax(t, initial=0.0) < _HOUR else _HOUR
         t = t + turn * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * turn)))
     return t

@@ -1,13 +1,13 @@
 """
 Detect the format of a table of text, such as a CSV, and read its columns of numbers.
 
-The format is detected in the first 64 kB: the encoding, delimiter, decimal mark, header lines and
-stated units with which most cells of the first lines are numbers, dates or times.
+The format (encoding, delimiter, decimal mark, header lines, stated units) is detected in the first
+64 kB: it is the one by which most cells are numbers, dates or times.
 
-The csv module of the standard library reads the rows, in blocks whose columns are converted
-to numbers at once.  Measured for 10^6 rows of 3 columns: 1.1 s of CPU, 3.2 s row by row;
-`numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the first rejects blank cells and
-text; the second rejects rows of another width, gives no line numbers, and takes 100 MB.
+The csv module of the standard library reads the rows, in blocks whose columns are converted to
+numbers at once. This takes 1.1 s of CPU for 10^6 rows of 3 columns; row by row it would take 3.2
+s. `numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the former rejects blank cells and
+text, and the latter rejects rows of another width, gives no line numbers, and takes 100 MB.
 """
 
 from __future__ import annotations
@@ -44,13 +44,14 @@ _MARK = ': the decimal mark is a point (with --decimal . a comma separates thous
 _PARTIAL = '; --partial leaves bad lines out'
 # Maximum characters of a line: a log of 1000 columns has lines of some 10 000.
 MOST_OF_LINE = 65536
-# Bytes, then lines, in which the format is detected; characters and rows read at once.
+# Bytes, and lines, in which the format is detected; characters, and rows, read at once.
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
-# A byte that no text holds.
+# A byte that does not occur in text.
 _DAMAGE = re.compile(rb'[^\t\n\r\f -\xff]')
 # Consecutive rows of numbers that mark the beginning of the data.
 _IN_A_ROW = 8
-# Steps of the time by which it leaps from a row that numbers the columns to the data.
+# Minimum leap of the first column, in its usual steps, from a row that numbers the columns to the
+# data.
 _LEAP = 10.0
 
 # Columns of `ros2 topic echo --csv` of a sensor_msgs/BatteryState, up to its cells.
@@ -72,13 +73,13 @@ _OF_PLAIN = re.compile(r'(?:^|,)[-+]?\d+\.(?!\d{3}(?!\d))\d+(?=,|$)', re.MULTILI
 # A number with both marks shows which of them separates thousands.
 _BOTH_MARKS = {'.': r'(?<![\d.,:])\d{1,3}(?:,\d{3})+\.\d+(?![\d.,:])',
                ',': r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+,\d+(?![\d.,:])'}
-# A blank between thousands, as spreadsheets write it, which separates no cells.
+# A blank between thousands, as spreadsheets write it, which does not separate cells.
 _BLANK = re.compile('(?<=\\d)[\xa0\u2007\u2009\u202f](?=\\d{3}(?!\\d))')
 # A number whose decimal comma is within quotes, and does not separate thousands.
 _QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
-# Possessive, so that the time is proportional to the length of a line of blanks.
+# Possessive, so that matching takes time proportional to the length of a line of blanks.
 _INTERVAL = re.compile(
     r'((?:sampl(?:e|ing)|time)[ _]*(?:interval|period)|sampl(?:e|ing)[ _]*time|'
     r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?[tx]|h_?resolution|'
@@ -108,7 +109,7 @@ class Form(NamedTuple):
     names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
     units: tuple[str, ...]  # As stated, '' if not stated
     width: int  # Cells of a row
-    indent: int  # Blank cells before each row of this table, if outer tables have other rows
+    indent: int  # Blank cells before each row, if rows of outer tables lie between them
     rows: tuple[tuple[str, ...], ...]  # The first rows
     step: float  # From row to row, s; NaN: not stated
     stated: str  # Words that state the step
@@ -237,7 +238,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
 
 
 def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
-    """Return the cells of each line, none of a comment or of a line that cannot be split."""
+    """Return the cells of each line; comments and lines that cannot be split have none."""
     rows: list[list[str]] = []
     for line in lines:
         try:
@@ -262,7 +263,7 @@ def _names_half(rows: list[list[str]]) -> int:
 
 
 def _joined(row: list[str], names: int) -> list[str]:
-    """Return the numbers of a row of twice as many whole numbers as names, else no cells."""
+    """Join pairs of whole numbers in a row of twice as many as names, else return no cells."""
     split = len(row) == 2 * names and all(map(re.compile(r'[-+]?\d+').fullmatch, row))
     return [f'{whole}.{part}' for whole, part in zip(row[::2], row[1::2])] if split else []
 
@@ -273,19 +274,19 @@ def _trimmed(row: list[str]) -> list[str]:
 
 
 def _of_table(row: list[str], indent: int) -> list[str]:
-    """Return a row, emptied if it belongs to an outer table, as battery testers write them."""
+    """Return a row, but no cells if it belongs to an outer table of a battery tester."""
     return [] if any(cell.strip() for cell in row[:indent]) else row
 
 
 def _labels_of(rows: list[list[str]]) -> tuple[str, ...]:
-    """Return the word before the number of each column, the same in two rows; '' if none."""
+    """Return the label before each column's number if two rows have the same, else ''."""
     either = [[found[0] if (found := _LABEL.match(cell)) and is_number(cell[found.end():]) else ''
                for cell in row] for row in rows[len(rows) // 2:][:2]]
     return tuple(one if one == other else '' for one, other in zip(either[0], either[-1]))
 
 
 def _end_of_facts(rows: list[list[str]], skip: int) -> int:
-    """Return the first row below named facts and a blank line; 0: another form."""
+    """Return the blank row that ends a block of named facts; 0: there is no such block."""
     words = [k for k, row in enumerate(rows) if k >= skip and row and row[0] and not (
         is_value(row[0]) or is_missing(row[0]))]
     end = words[-1] + 1 if len(words) > _IN_A_ROW else 0
@@ -327,9 +328,9 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
 
 
 def _numbering(rows: list[list[str]]) -> int:
-    """Return the lines of a row that numbers the columns below their names; 0: there is none."""
-    # Such a row is 1, 2, 3 ...; below it is a blank line, or a first column that does not go on
-    # from 1: it goes back, or leaps.
+    """Return the number of rows to skip if the first one numbers the columns, else 0."""
+    # Such a row is 0, 1, 2 ... or 1, 2, 3 ...; below it is a blank line, or the first column goes
+    # back or leaps.
     row = _trimmed(rows[0]) if rows else []
     if len(row) < 2 or row not in ([f'{k + one}' for k in range(len(row))] for one in (0, 1)):
         return 0
@@ -341,7 +342,7 @@ def _numbering(rows: list[list[str]]) -> int:
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
-    """Return lines with decimal points, comments emptied, and delimiting blanks made single."""
+    """Return lines with decimal points, without comments, and with single blanks as delimiters."""
     lines = ['\n' if line.lstrip().startswith(COMMENTS) else
              line if line.isascii() else _BLANK.sub('', line) for line in lines]
     if lines and _RECEIVED.match(lines[0]):
@@ -388,7 +389,8 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     names, units, line = next((found for above in (plain, comments) if (
         found := _names_and_units(above, width, needed))), ([], [], 0))
     names = names or _names_in_rows([row for row in rows[first:] if any(row)], width)
-    # A label before the names is not a column's name if another line has one before its numbers.
+    # A label before the names is not a column's name if another line has a label before its
+    # numbers.
     some = _trimmed(names)
     labelled = needed and needed == {*range(len(some) - 1)} and _OF_NAMES.search(some[0]) and any(
         list(map(is_value, _trimmed(row))) == [False] + [True] * len(needed)
@@ -401,7 +403,7 @@ def _names_in_rows(rows: list[list[str]], width: int) -> list[str]:
     numbered = [f'column {k + 1}' for k in range(width)]
     if rows and all(map(_is_battery_state, rows)):
         return _BATTERY_STATE + numbered[len(_BATTERY_STATE):]
-    # Dumps of MAVLink name each number in the cell at its left; a single name may be a frame's.
+    # MAVLink dumps name each number in the cell to its left; a single name may be a frame's.
     before = [{row[k] if is_number(row[k + 1]) else '' for row in rows}
               for k in range(min(map(len, rows), default=0) - 1)]
     named = {k + 1: name for k, words in enumerate(before) if len(words) == 1 and re.fullmatch(
@@ -428,7 +430,7 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
         return len(named) == len(needed) and not any(map(is_value, named))
 
     if above and not names_all(above[-1][1]):
-        # Below the line of units, one of sources may follow.
+        # A line of sources may follow the line of units.
         above = next((above[:k + 1] for k in range(len(above) - 1, 0, -1) if _are_units(
             above[k][1]) and names_all(above[k - 1][1])), above)
     # A fact with a decimal number is not a line of names.
@@ -488,7 +490,7 @@ def _unit_above(names: list[str], k: int, begin: int, above: list[list[str]]) ->
         cells = [row[-1]] if k and len(row) > 1 and row[0] == names[k] else []
         if 'unit' in row[0].lower():
             cells = [*row[label:label + 1], *row[place:place + 1]]
-            # Blank cells between the units.
+            # If blank cells separate the units, count only the units.
             units = [cell for cell in row[1:] if cell]
             if len(units) == len(names) - begin < len(row) - 1:
                 cells = [units[place - 1]]
@@ -506,7 +508,7 @@ def has_unit_beside(names: Sequence[str], place: int) -> bool:
 
 
 def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
-    """Return the unit in the next column, such as Volt DC, if that is named so; '' if mixed."""
+    """Return the unit in the next column, if that is a column of units; '' if mixed."""
     words = [unit_word(row[place + 1]) for row in rows if any(row[place + 1:place + 2])
              ] if has_unit_beside(names, place) else []
     kinds = {WORDS.get(word, word)[-1:] for word in words}
@@ -514,7 +516,7 @@ def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str
 
 
 def _are_units(row: list[str]) -> bool:
-    """Return whether a row states units: just one, or several and at most as many other words."""
+    """Return whether a row states units: one alone, or several and at most as many other words."""
     words = [cell.strip('[](){} ').lower() for cell in row]
     some = sum(word in WORDS for word in words)
     others = sum(word not in WORDS and word not in OTHER_WORDS and not is_number(word)
@@ -523,7 +525,7 @@ def _are_units(row: list[str]) -> bool:
 
 
 def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
-    """Return the step of numbered rows, s, and the words that state it."""
+    """Return the stated time between rows, s, and the words that state it."""
     for name, cell in chain.from_iterable(map(zip, above, above[1:])):
         if name.lower() == 'increment' and is_number(cell):
             return float(cell), name
@@ -618,7 +620,7 @@ def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int
 
 
 def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
-    """Return cells, with the unit of their row where it is not that of the column."""
+    """Return cells, followed by the unit of their row where it differs from the column's."""
     return tuple(cell if is_missing(cell) or unit_word(unit) in ('', stated)
                  else ' '.join([cell, *sorted(unit.split(), key=lambda one: not unit_word(one))])
                  for cell, unit in zip(cells, units))

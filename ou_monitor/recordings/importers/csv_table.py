@@ -1,11 +1,11 @@
 """
 Read a table of text, such as a CSV: time, voltage and, where present, throttle and current.
 
-Limits: a file is one flight; all rows have the same number of cells.  If rows hold a value and
-the name of its series, each series is read as a column of that name.  Columns and units are found
-by names and sizes and reported in one note; fields of `CsvColumns` override them.  A unit in a
-name or in a line of units is taken as stated; an unstated unit is guessed from the values.
-`time_s`, `voltage_v`, `throttle` and `current_a` are taken first and need no note.
+Limits: a file is one flight; all rows have the same number of cells. If rows hold a value and the
+name of its series, each series is read as a column of that name. Columns and units are found by
+names and by the sizes of values, and reported in one note; fields of `CsvColumns` override them. A
+unit in a name or in a line of units is taken as stated; an unstated unit is guessed from the
+values. `time_s`, `voltage_v`, `throttle` and `current_a` are taken first and need no note.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ NONE = 'none'
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
 _BACK = 0.25
-# Minimum rows before repeated stamps are put down to a coarse clock.
+# Minimum number of rows for conclusions from comparing rows, such as repeated stamps.
 _FEW_ROWS = 8
 
 
-# Quantity -> patterns of the end of a column's name without its unit, the best first; in lower
-# case, other characters as '_'.  From the exports named in test_csv_exports.py.
+# Quantity -> patterns of the end of a column's name without its unit, the best first; names are in
+# lower case, with '_' for other characters. From the exports named in test_csv_exports.py.
 _VALUE_NAME = r'_?(?:values?|reading|data|ampl(?:itude)?|wert|messwert)?'
 _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
 _PATTERNS = {
@@ -119,7 +119,7 @@ class _Table(NamedTuple):
 
 def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = False,
              ) -> RawColumns:
-    """Read the samples of a supply, unsorted and with NaN kept; partial: without bad lines."""
+    """Read the samples of a supply, unsorted, with NaN kept (partial: leave out bad lines)."""
     left_out: list[str] | None = [] if partial else None
     table = _table(path, columns or CsvColumns(), needed=True, left_out=left_out)
     said = [table.note] if table.note else []
@@ -185,7 +185,7 @@ def read(path: Path, request: Request) -> Log:
         others = [name for name in dict.fromkeys(header) if name not in known]
         if len(others) > MOST_COLUMNS:
             notes.append(f'{len(others) - MOST_COLUMNS} more columns are not listed.')
-        # One pass each: a column of text stops only its own pass.
+        # Read each column in a pass of its own, because a column of text stops the pass.
         for name in others[:MOST_COLUMNS]:
             try:
                 values, = numbers(path, table.form, [table.form.names.index(name)])
@@ -259,7 +259,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
         _check_one_series(path, raw, t, raw.names[value], np.where(mine, mixed, np.nan))
         values, stamps, t = [mixed[mine]], t, t[mine]
         for rows in others_of:
-            # The last value of each series at the stamps of the voltage.
+            # Hold the last value of each other series at the stamps of the voltage.
             part = np.flatnonzero(rows)
             part = part[np.argsort(stamps[part], kind='stable')]
             values.append(np.append(mixed[part], np.nan)[
@@ -281,7 +281,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for (quantity, column), column_values in zip(found.items(), values):
         several = [column_values, *islice(rest, len(group[quantity]))]
         if quantity == logs.VOLTAGE:
-            # Absent cells of a pack read as unknown.
+            # Cells that the pack does not have read 65535 (unknown).
             column_values = column_values + sum(np.where(np.isfinite(cell) & (
                 cell != 65535.0), cell, 0.0) for cell in several[1:])
         elif len(several) > 1:
@@ -312,7 +312,7 @@ def _rest_of_group(form: Form, quantity: str, column: FileColumn, wanted: CsvCol
 
 
 def _mean_of_motors(values: list[FloatArray]) -> FloatArray:
-    """Return the mean of the motors that run at any time, as of a ULog: a stopped one is 0."""
+    """Average the motors that run at any time, as for a ULog: a stopped one counts as 0."""
     used = np.array([one for one in values if np.isfinite(one).any()] or values[:1])
     return np.where(np.isfinite(used).any(axis=0), np.nansum(used, axis=0) / len(used), np.nan)
 
@@ -345,14 +345,14 @@ def _column_place(path: Path, form: Form, name: str, option: str) -> int:
 
 
 def _plain_names(form: Form) -> list[str]:
-    """Return the names without units, as the patterns have them."""
+    """Return the names without units, in the form that the patterns expect."""
     return [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') or 'time' * bool(
         unit) for name, unit in zip(form.names[:form.width], form.units)]
 
 
 def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = False
             ) -> list[int]:
-    """Return the candidate columns of a quantity, the best first (text: those of words)."""
+    """Return the candidate columns of a quantity, the best first (text: columns of words)."""
     plain = _plain_names(form)
     ends = [re.sub(r'\W+', '_', re.split(
         r'[/.:](?=[^/.:])(?![^\[(]*[\])]$)', name.strip().lower())[-1]).strip('_')
@@ -366,7 +366,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
             for k in free if re.fullmatch(pattern, texts[k] or ' ')
             and (form.units[k] in right or not form.units[k])))
         if found:
-            # Stated units decide between names: `v [V]` before `u`.
+            # Names with a stated unit come first: `v [V]` before `u`.
             return sorted(found, key=lambda k: form.units[k] not in right)
     others = '|'.join(pattern for name, patterns in _PATTERNS.items() if name != quantity
                       for pattern in patterns[:3])
@@ -380,7 +380,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
 
 
 def _time_of(path: Path, form: Form, wanted: CsvColumns) -> FileColumn:
-    """Return the column of the time, or that rows are counted."""
+    """Return the column of the time; it has no place if rows are counted."""
     if wanted.sample_interval is not None:
         return FileColumn((), '--sample-interval', 's', wanted.sample_interval)
     if wanted.time is not None:
@@ -407,7 +407,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> FileColumn:
     if 'sec' in form.names and (parts := _parts_of_second(form, form.names.index('sec'))):
         return parts
     filled = _nameless_columns(form)
-    # The first column that goes on in every row, else the first if it never goes back.
+    # Take the first column that rises in every row, else the first column if it never falls.
     rising = [k for k in filled[:len(filled) - 1] if len(form.rows) >= _FEW_ROWS and (
         np.diff(_times(form, k)) > 0.0).all()] or [k for k in filled[:1] if _rises(form, k)]
     if len(filled) > 1 and rising:
@@ -419,7 +419,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> FileColumn:
 
 
 def _finest(form: Form, first: int) -> int:
-    """Return another time if the chosen one starts anew or does not tell the rows apart."""
+    """Return another time column if the chosen one is coarse, starts anew or often repeats."""
     named = [k for k in range(min(form.width, len(form.names)))
              if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
              and not re.search(
@@ -455,7 +455,7 @@ def _parts_of_second(form: Form, clock: int) -> FileColumn | None:
 
 
 def _nameless_columns(form: Form) -> list[int]:
-    """Return the columns without a telling name whose first cells are numbers."""
+    """Return the columns of numbers whose names do not state a quantity."""
     filled = [k for k in range(form.width) if form.rows and len(form.cells(k)) == len(
         form.rows) and all(map(is_value, form.cells(k)))]
     # In a file with names, only a single column beside the time; others may hold several series.
@@ -464,7 +464,7 @@ def _nameless_columns(form: Form) -> list[int]:
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
-    """Return the only column, or the first of several if its relative variation is smallest."""
+    """Return the only column, or several if the first of them varies least; else none."""
     # A load changes a supply's voltage by a few percent, and its current by far more.  Constant
     # columns, and those anywhere below 1, are not compared.
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
@@ -527,7 +527,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
             continue
         places = _choose(form, quantity, taken)
         if not places and quantity == logs.VOLTAGE:
-            # Another option may have taken it; that is refused below.
+            # Another option may name the column of the voltage; that is refused below.
             places = [k for k in _choose(form, quantity) if k in given]
         if quantity == logs.VOLTAGE:
             # Prefer a voltage that has a current of the same name.
@@ -567,7 +567,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
 
 def _series_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn,
                ) -> tuple[Form, int, int] | None:
-    """Return the form of the series that rows name, and the columns of their names and values."""
+    """Return a form of the series that rows name, and the columns of names and values."""
     named = _choose(form, logs.VOLTAGE, time.place)
     if not form.line or not time.place or (
             named if wanted.voltage is None else _place_of(form, wanted.voltage) is not None):
@@ -594,7 +594,7 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn,
 def _read(path: Path, form: Form, time: FileColumn, places: list[int],
           left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
           only: tuple[int, frozenset[str]] | None = None) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
+    """Return the time as written (dates and clocks in s), and columns; texts as in `numbers`."""
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
             raise InputError(f"{path}: by '{time.name}' the rows are {time.scale:g} s apart, not "

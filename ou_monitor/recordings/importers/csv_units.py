@@ -2,7 +2,7 @@
 Convert columns of a table of text to SI: stamps in s, voltage in V, throttle 0..1, current in A.
 
 A stated or given unit is used; otherwise the unit is guessed from the sizes of the values, and the
-words about it say so.
+words returned with it say so.
 """
 
 from __future__ import annotations
@@ -22,34 +22,35 @@ from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import clock_unit, FloatArray, LONGEST_STEP, TIME_UNITS
 from ou_monitor.timeline import MOST_THROTTLE, WILD
 
-# Unit -> ends of the throttle; other ends are written LOW:HIGH.
+# Unit -> values at throttle 0 and 1; other values are written LOW:HIGH.
 THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'ms': (1.0, 2.0)}
 PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit in THROTTLE_UNITS}
-# Ends of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
+# Largest values of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
 _STICKS = (1024, 10000, 32768)
-# Ends of the stick in the flight logs of DJI, by the names that CsvView and PhantomHelp write.
+# Ends of the stick in DJI's flight logs, whose columns CsvView and PhantomHelp name.
 _DJI = '364:1684'
-# Maximum step and span of a time, s; an unstated unit is the coarsest one within both.
+# Usual maximum step and span of a recording, s; an unstated unit of time is taken to be the
+# coarsest one within both.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 # Number of the first day of 1970 in Excel and MATLAB; days from there to 2100.
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
-# Values of a counter of 32 bits; seconds of a day.
+# Number of values of a 32-bit counter; seconds per day.
 _COUNTS, _DAY = 2.0**32, 86400.0
 # To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
 # deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
-# Change by rounding; standard errors above which a mean change is significant.
+# Maximum change by rounding, V; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0
 # A voltage without a unit above this is in mV: no craft's pack has that many volts.
 _MOST_VOLTS = 1000.0
-# Maximum of an unknown throttle up to which it is not taken as percent: levers give up to 5 V.
+# A throttle without a unit is not taken for percent up to this maximum: levers give up to 5 V.
 _LEAST_PERCENT = 5.5
 
 
 class FileColumn(NamedTuple):
     """A selected column."""
 
-    place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
+    place: tuple[int, ...]  # Its columns: two for a date and a time, none if rows are counted
     name: str
     unit: str  # As stated or given, '' if neither
     scale: float  # Factor by the maker's definition; 0: by the unit
@@ -118,7 +119,7 @@ def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: F
             unit, t = 'd', t - first
         words = '' if unit == 's' else ', a guess: --time-unit'
     t = t * SCALES[unit]
-    # A unit of minutes or more is no mistake for a finer one; a unit from the user is accepted.
+    # A stated unit of a minute or more is not mistaken for a finer one; the user's is accepted.
     if usual * SCALES[unit] > LONGEST_STEP and SCALES[unit] <= 1.0 and not wanted.time_unit:
         raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? Give --time-unit")
@@ -168,7 +169,7 @@ def in_si(quantity: str, column: FileColumn, values: FloatArray, given: str | No
         if guess and column.name.lower() == 'rc.throttle' and known.size and known.max() > 100.0:
             unit = _DJI
         unit = unit or _throttle_unit(values[np.isfinite(values)], volts)
-        # Percentages below 0 are of a stick, except a duty, which is of a motor in reverse.
+        # Negative percentages come from a stick, or, as a duty, from a motor in reverse.
         if given is None and unit == '%' and np.mean(values < -MOST_THROTTLE) > WILD and not (
                 re.search('duty|pwm', column.name.lower())):
             guess, unit = True, '-100:100'
@@ -207,7 +208,7 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
         # Pulses in ms.
         return '1:2'
     beyond = known[known > MOST_THROTTLE]
-    # With a voltage within 0 to 1 it may be the voltage: `check_throttle` reports it.
+    # If the voltage is within 0 to 1, the columns may be swapped: `check_throttle` reports it.
     if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
         return '1'
     if high <= 110.0:

@@ -1,5 +1,5 @@
 """
-ArduPilot dataflash, binary and text, read by pymavlink.
+Read ArduPilot dataflash logs, binary and text, with pymavlink.
 
 Limits: ArduPilot averages the battery's ADC before logging it, by default
 at 10 Hz.  The parameters `SERVOn_FUNCTION` of the log identify the motor
@@ -136,7 +136,8 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
 
 def _close(log: Any) -> None:
     for name in ('data_map', 'filehandle'):
-        # A memory map that a failed `__init__` still uses cannot be closed; it is freed with it.
+        # A memory map that a failed `__init__` still uses cannot be closed; it is freed with
+        # `log`.
         with suppress(BufferError):
             if hasattr(log, name):
                 getattr(log, name).close()

@@ -1,7 +1,7 @@
 """
-The table of formats, identified by their first bytes, and the entry to the log importers.
+The table of file formats, identified by their first bytes, and the entry point to importers.
 
-To add a format: a module here with ``read(path, request) -> Log``, and a line in the table.
+To add a format, add a module here with ``read(path, request) -> Log``, and a line in the table.
 """
 
 from __future__ import annotations
@@ -137,12 +137,12 @@ def detect(path: Path) -> Format:
                      'read: ' + '; '.join(one.words for one in FORMATS if one.module))
 
 
-# Endings of bags and their metadata; text with any other is read as a table.
+# Endings of bags and their metadata; text with any other ending is read as a table.
 _OF_BAGS = ('.mcap', '.db3', '.bag', '.yaml', '.yml')
 
 
 def kind_of(path: Path) -> str:
-    """Return the name of the format as which a recording is read: CSV, that of a log, or BAG."""
+    """Return the name of the format in which a recording is read: CSV, a log's, or BAG."""
     found, ending = None, path.suffix.lower()
     # The reader reports why it cannot be read.
     with suppress(InputError):

@@ -46,9 +46,10 @@ IMU, SPEEDS = 'imu', 'motor_speed'
 UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A', IMU: 'rad/s, m/s^2', SPEEDS: 'rad/s'}
 UNKNOWN = '?'
 
-# Maximum magnitude: larger values come from corrupt bytes, and a message could not hold them.
+# Maximum magnitude of a value; larger ones come from corrupt bytes.
 LARGEST = 1e9
-# Stamps come from corrupt bytes if fewer than _FEW samples are over _FAR from all others.
+# A group of fewer than _FEW stamps that is more than _FAR from all others comes from corrupt
+# bytes.
 _FAR = 3600.0  # s
 _FEW = 16
 Progress = Callable[[float], None]
@@ -58,12 +59,12 @@ Progress = Callable[[float], None]
 class Series:
     """One quantity over time, in SI units."""
 
-    # Name for the user, unique in the log: ``BAT[0].Volt``; of SPEEDS, the names of the motors.
+    # Name for the user, unique in the log: ``BAT[0].Volt``; for SPEEDS, the names of the motors.
     name: str
     quantity: str  # VOLTAGE, THROTTLE, CURRENT, SIGNAL, ANY, IMU or SPEEDS
     t: FloatArray  # Stamps, s from the start of the log; shape (n,)
-    # V, 0..1, or A (positive when the battery is drained); NaN where the log says "unknown";
-    # shape (n,).  Of IMU (n, 3), or (n, 6) with accelerometer; of SPEEDS (n, motors).
+    # V, 0..1, or A (positive when the battery is drained); NaN where the log says "unknown"; shape
+    # (n,). For IMU (n, 3), or (n, 6) with accelerometer; for SPEEDS (n, motors).
     values: FloatArray
     scale: str  # Conversion from the logged value
     words: str = ''  # Description

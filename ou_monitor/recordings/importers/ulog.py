@@ -1,5 +1,5 @@
 """
-PX4 ULog, read by pyulog.
+Read PX4 ULog files, with pyulog.
 
 Limits: ULog has no end mark and no checksums, so a log truncated
 between two messages looks complete.  PX4 may have low-passed the voltage
@@ -158,7 +158,7 @@ def _topics(names: frozenset[str]) -> list[str]:
 
 
 def _declared(ulog: Any) -> Iterator[str]:
-    """Yield names of fields by the formats of the log, instance 0."""
+    """Yield the names of all fields that the log defines, as instance 0."""
     for topic, form in ulog.message_formats.items():
         for _, size, field in form.fields:
             if field != 'timestamp' and not field.startswith('_padding'):
@@ -210,7 +210,7 @@ def _facts(ulog: Any) -> dict[str, str]:
     if uuid.strip('0'):
         facts['vehicle'] = f'{board} {uuid}'.lstrip()
     elif board:
-        # Without a serial number (simulators state 0); many vehicles have the same board.
+        # There is no serial number (simulators state 0), and many vehicles have the same board.
         facts['board'] = board
     given = ulog.initial_parameters
     cells = given.get('BAT1_N_CELLS', given.get('BAT_N_CELLS', 0))
