@@ -1,7 +1,7 @@
 """
-The parameters of the two nodes: name, default, range and description.
+Parameters of the nodes `estimator` and `adaptive_filter`: name, default, range and description.
 
-A parameter is a field of a class of settings.  The nodes declare their ROS parameters from these
+Each field of a settings class is a parameter. The nodes declare their ROS parameters from these
 fields, and the YAML in `config/` is tested against them.
 """
 
@@ -60,7 +60,7 @@ LAWS = ('constant_noise', 'kalman', 'threshold')
 
 
 def _documented(settings: type[_Settings]) -> type[_Settings]:
-    """Add the parameters to the docstring of settings, before the examples."""
+    """List the parameters in the docstring of a settings class, before its examples."""
     head, mark, tail = str(settings.__doc__).partition('    Examples\n')
     lines = [f'    {one.name} : {one.type}\n        {one.metadata["description"]}\n'
              for one in fields(cast('Any', settings))]
@@ -68,8 +68,8 @@ def _documented(settings: type[_Settings]) -> type[_Settings]:
     return settings
 
 
-# Default limit, V, which is for a 5 V rail, and range of the median voltage of such a rail, V: a
-# lower voltage is a lithium cell, or a rail in constant brown-out.
+# Default limit, V, for a 5 V rail, and the range of the median voltage, V, that counts as a 5 V
+# rail: a lower voltage is a lithium cell, or a rail in constant brown-out.
 DEFAULT_LIMIT, RAIL = 4.5, (4.5, 6.0)
 
 
@@ -262,7 +262,7 @@ class FilterSettings:
     @classmethod
     def from_options(cls, options: Mapping[str, object],
                      base: FilterSettings | None = None) -> FilterSettings:
-        """Return settings with options changed; a default fallback is moved into fmin..fmax."""
+        """Return settings with options changed; if not given, fallback moves into fmin..fmax."""
         values = _known(options, cls, 'filter option')
         old = base or cls()
         if 'fallback' not in values:
@@ -372,7 +372,7 @@ class NotchSettings:
 
     @property
     def per_unit(self) -> float:
-        """Return the revolutions per second of the shaft for one unit."""
+        """Shaft revolutions per second for one unit of `rpm_unit`."""
         scale, electrical = RPM_UNITS[self.rpm_unit]
         return scale / (0.5 * self.poles) if electrical else scale
 

@@ -1,12 +1,12 @@
 """
-Whether an input can be trusted: stamps against arrival, readings against each other, the unit.
+Decide whether an input can be trusted, from its stamps, its unit, and whether it is stuck.
 
 `SupplyMonitor` uses `InputTrust`, in the node and offline; the adaptive filter checks its messages
 by the same `StampWatch`, and falls back to arrival times (`InputClock`).
 
-Limits: stamps count as good if less than a tenth of them are late, or if messages are repeated.
-Until the first change of the reading, a stuck sensor cannot be distinguished from a coarse one; so
-both count as stuck until then.
+Limits: stamps count as good while at most a tenth of them are late; repeated messages do not count
+as late. Until the reading first changes, a stuck sensor looks like a coarse one, so both count as
+stuck.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN
 
-# Maximum silence of a fast source, even if `stale_after` is longer: number of missing samples, but
-# at least this time, s, because a busy computer pauses that long.
+# Silence after which a fast source is stale, even if `stale_after` is longer: this number of
+# sample intervals, but at least this time, s, because a busy computer may pause that long.
 MISSED, LEAST_PATIENCE = 300, 0.3
 # Minimum number of samples for the rate of a source.
 _MEASURED = 20
@@ -29,20 +29,21 @@ _MEASURED = 20
 SLOW_MISSED = 2.5
 # Minimum step between arrivals of a slow source, s; LEAST_PATIENCE covers shorter steps.
 _SLOW_STEP = LEAST_PATIENCE / SLOW_MISSED
-# Maximum number of slow steps whose median is the interval; minimum number; minimum share of the
-# time that they cover.
+# The interval is the median of this number of latest slow steps; minimum number of them; minimum
+# share of the time that they must cover.
 _SLOW_KEPT, _SLOW_FEWEST, _SLOW_SHARE = 5, 2, 0.5
-# Number of messages for the share of late ones, and minimum number for a decision.
+# Number of latest messages among which late ones are counted; minimum number for a decision.
 _LOOK, _FEWEST = 200, 20
 _IRREGULAR = 0.1  # Share of late messages above which a source is irregular
 # A stamp this far behind the newest, s, starts a new time line (as in `stream.samples`).
 BACK = 0.1
-# Stamps of the filter's input are frozen after this time, s: 10 ticks of a clock of 10 ms.
+# Time without a newer stamp after which the stamps of the filter's input count as frozen, s: 10
+# ticks of a clock of 10 ms.
 FROZEN_AFTER = 0.1
 
 
 def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0.0) -> float:
-    """Return the silence after which a source is stale, s (interval of a slow source, s)."""
+    """Return the silence after which a source is stale, s (interval between arrivals, s)."""
     limit = settings.stale_after
     if n >= _MEASURED and rate > 0.0:
         limit = min(limit, max(LEAST_PATIENCE, MISSED / rate))
@@ -50,7 +51,7 @@ def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0
 
 
 class SourceInterval:
-    """Interval between arrivals of a slow source, s; 0 if it is unknown or up to 0.12 s."""
+    """Interval between arrivals of a slow source, s; 0 if unknown or at most 0.12 s."""
 
     def __init__(self) -> None:
         self.value = 0.0
@@ -59,7 +60,7 @@ class SourceInterval:
         self._steps: deque[tuple[float, float]] = deque(maxlen=_SLOW_KEPT)
 
     def push(self, times: FloatArray) -> None:
-        """Take times in order of arrival, s; a step back starts again."""
+        """Take times in order of arrival, s; a step back discards earlier steps."""
         now = float(times[-1])
         if not 0.0 <= now - self._last <= _SLOW_STEP:
             steps = np.diff(times, prepend=self._last)
@@ -105,14 +106,15 @@ class StampOrder(enum.Enum):
 
 
 class StampWatch:
-    """Checks that stamps of arriving samples advance; `newest`: stamp of this time line, s."""
+    """Checks that stamps of arriving samples advance; `newest`: newest of this time line, s."""
 
     def __init__(self) -> None:
         self.newest = -math.inf
-        # For each recent batch: samples, and how many were late or started a new time line.
+        # For each recent batch: number of samples, and of those that were late or started a new
+        # time line.
         self._batches: deque[tuple[int, int]] = deque()
         self._looked = self._late = 0
-        # Samples since the newest stamp; arrival of that stamp, and of the last sample.
+        # Number of samples since the newest stamp; arrival of that stamp, and of the last sample.
         self._since = 0
         self._advanced = self._arrived = NAN
 
@@ -207,21 +209,21 @@ class InputClock:
 # sources: 2.81 s (139 readings) on the ground (in_xr_141340); in flight 1.70 s (172 readings,
 # cf_solo_large), or 3 readings at 1 Hz (ac_jd_2004).
 _STUCK, _STUCK_READINGS = 5.0, 10
-# While throttle is constant, the time is at least this factor times the longest constant reading
-# that ended with one ADC step: a coarse ADC repeats its reading during a slow discharge.
+# While throttle is constant, the limit is at least this factor times the longest constant run that
+# ended by one ADC step: a coarse ADC repeats its reading during a slow discharge.
 _QUIET = 4.0
 # Range within which throttle counts as constant (cf_solo_large: 0.019 within 1.06 s of hover).
 _STILL = 0.05
 # Maximum size of one ADC step, in smallest changes: printed digits round steps (5 or 6 mV).
 _ONE_STEP = 1.5
-# Maximum time, s, that one step adds to a constant reading: a gap is not a constant reading.
+# Maximum time, s, that one sample interval adds to a constant run: most of a gap is not counted.
 _COUNTED = 1.0
 # Minimum change, as a share of the reading: float32 rounds by 6e-8.
 _CHANGE = 1e-6
 
 
 class ConstantReading:
-    """Durations for which readings stay constant: the newest one, and ones that did change."""
+    """Measures for how long the reading has been constant, and how long earlier runs lasted."""
 
     def __init__(self) -> None:
         self.value = NAN
@@ -229,7 +231,7 @@ class ConstantReading:
         # The present run: readings, time in s, lowest and highest throttle (NaN: unknown).
         self._n, self._time = 0, 0.0
         self._throttle = (NAN, NAN)
-        # Smallest change, V, and longest run that ended by it, s.
+        # Smallest change, V, and longest run that ended by one ADC step, s.
         self._step, self._quiet = math.inf, 0.0
         self._at = NAN
 
@@ -311,7 +313,7 @@ class InputTrust:
         self._interval = SourceInterval()
         self._still = ConstantReading()
         self._recent = np.empty(0)
-        # Reason from outside; empty: none.
+        # Reason set by the caller; empty: none.
         self.outside = ''
 
     def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,

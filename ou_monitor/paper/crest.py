@@ -28,7 +28,8 @@ SCREENS_MS = (10, 100, 500)
 TYPICAL_MS = 100  # Length for the statements and the plot, ms
 # Share of screens below, and above, the band of crest factors.
 TAIL = 0.05
-# Oscilloscope samples per step of the simulation; segments in memory; screens of white noise.
+# Oscilloscope samples per step of the simulation; segments in memory at once; number of screens of
+# white noise.
 _SAMPLES, _AT_ONCE, _WHITE = 100, 100, 200
 
 

@@ -9,22 +9,22 @@ simulations with levels at 2.5 and 3.2 standard deviations (extrapolated to a ti
 first was 60 times too low (noise through a large ESR) to 4 times too high (no ESR), the second 1.1
 to 3 times too high.
 
-Both risks fall as C rises once the network is slower than the noise; below that C, the second rose
-by up to 1.44 times in 39 of 6000 random networks.
+Once C is large enough that the network is slower than the noise, both risks fall as C rises. Below
+that C, the second rose by a factor of up to 1.44 in 39 of 6000 random networks.
 
-`network_of` chooses components that reproduce a flight. All risks of its bus are then computed as
-the live risk at the end of the flight, which also gives the throttle budget of `analyze`. For
-other components, the sag is scaled with the resistance, and the noise with the noise of the
-network. A given resistance or battery voltage changes the risk as a row of the table does: the
-current remains that of the recorded resistance. A component that the recording does not show (the
-capacitor, or the resistance without a measured current) counts as that of the recorded craft,
-whether it is given or the default. The risks
-include the errors of sag and level and what throttle did not explain. Limits: sag and noise are as
-measured, including the white noise and the filter of the sensor. Noise added by changes of
-throttle, and an OU if one was found, count as slow fluctuations of the current, which capacitors
-on a board do not change; the rest is attributed to the switching of the ESCs. Without a measured
-current, the resistance is the given or default one, and the current is scaled to fit the sag: the
-effect of packs in parallel is still right, the effect of an ESR uncertain.
+`network_of` chooses components that reproduce a flight. The risks of its bus are then computed by
+the model that also gives the throttle budget of `analyze`, at the end of the flight. For other
+components, the sag is scaled with the resistance, and the noise with the noise of the network. If
+a resistance or battery voltage is given, the motor current stays as computed with the recorded
+resistance, as in the rows of the table. A component that the recording does not show (the
+capacitor; without a measured current also the resistance) is taken to be the recorded craft's,
+whether it is given or the default. The risks include the errors of sag and level, and the scatter
+that throttle did not explain. Limits: sag and noise are as measured, including the white noise and
+the filter of the sensor. Noise added by changes of throttle, and an OU if one was found, count as
+slow fluctuations of the current, which capacitors on a board do not change; the rest is attributed
+to the switching of the ESCs. Without a measured current, the resistance is the given or default
+one, and the current is scaled to fit the sag: the effect of packs in parallel is still right, the
+effect of an ESR uncertain.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ RAIL_BROWNOUT = {
     RAIL: (DEFAULT_LIMIT, 'lower limit of the 5 V rail in PX4'),
     (3.0, 3.6): (2.88, 'STM32F405 brown-out reset level 3, falling, highest (ST DS8626)')}
 LEAST, MOST = 10e-6, 22e-3  # Range of capacitances, F
-# Capacitances tried before the root is refined, because the risk may not be monotonic.
+# Number of capacitances tried before the root is refined, because the risk may not be monotonic.
 _GRID = 81
 # Lower limit of a rate of brown-outs, 1/s.
 _NEVER = 1e-300
@@ -66,7 +66,7 @@ FlownRisk = Callable[[float, float, float], float]
 
 
 class DesignVerdict(enum.Enum):
-    """The verdict of a design."""
+    """Verdict on a design; the value is its wording."""
 
     ENOUGH = 'the present capacitor is enough'
     FOUND = 'a capacitance in the range brings the risk under the target'
@@ -90,8 +90,8 @@ class DesignRow:
     # Sag of the bus and mean of the rail, V; independent of the capacitor.
     sag: float
     mean: float
-    # Mean time to brown-out of the OU from its mean, s; may be inf.  If the mean has an error,
-    # this is computed back from `risk_ou`.
+    # Mean time to brown-out of the OU from its mean, s; may be inf. If the mean has an error, this
+    # is computed from `risk_ou`.
     mean_time: float
     crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
     # Probability within the horizon, by mean first passage of the OU and by the crossing rate.
@@ -112,15 +112,15 @@ class DesignRow:
 
 @dataclass(frozen=True)
 class Lever:
-    """The benefit of one change of the craft."""
+    """One change of the craft, and the risk after it."""
 
     name: str  # What is changed.
     unit: str  # Unit of the values as shown.
     present: float
     tried: float  # A value that is easy to get.
     risk: float  # Risk with the value tried.
-    # Value of the smallest change that meets the target (the present value: none is needed); NaN:
-    # out of reach.
+    # Value after the smallest change that meets the target (the present value if it already does);
+    # NaN: out of reach.
     least: float
 
     def words(self, value: float) -> str:
@@ -208,7 +208,7 @@ def _times(rail: Rail, voltage: float) -> tuple[float, float]:
 
 
 def _risks(horizon: float, mean_time: float, crossing: float) -> tuple[float, float]:
-    """Return the probabilities within a horizon, s, of the OU and of the crossing rate."""
+    """Return the risks within a horizon, s: first passage of the OU, crossing rate."""
     return (1.0 if mean_time == 0.0 else -math.expm1(-horizon / mean_time),
             -math.expm1(-horizon * crossing))
 
@@ -219,7 +219,7 @@ def design(
     sag_error: float = 0.0, flown: FlownRisk | None = None, assumed: bool = False,
 ) -> Design:
     """
-    Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F).
+    Find the minimum bulk capacitance that meets a brown-out risk (V, s, F).
 
     sag_error as in `row_of`, for a network without a flight; flown: the risk of a flight at this
     voltage and horizon, from which all rows and levers are then computed.
@@ -469,9 +469,9 @@ _EXPONENTS = 1.0, 4.0
 
 @dataclass(frozen=True)
 class Flight:
-    """Facts of a supply from a recording, as numbers; NaN: unknown."""
+    """What a recording shows of its supply; NaN: unknown."""
 
-    level: float  # Open-circuit voltage at its end, V
+    level: float  # Open-circuit voltage at the end of the recording, V
     full: float  # Highest median of half a second, V
     cells: int  # In series; 0: unknown
     throttle: Sequence[float]  # 0..1, at which the next four fields are given
@@ -480,7 +480,7 @@ class Flight:
     noise: Sequence[float]  # Rms as flown, V
     steady: Sequence[float]  # Rms while throttle is constant, V
     flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
-    resistance: float  # After a second, from a measured current, Ohm
+    resistance: float  # Sag after a second over the measured current, Ohm
     alpha: float  # Relaxation rate of the OU, 1/s
     var_inf: float  # Variance of the OU, V^2
 
@@ -502,7 +502,7 @@ def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerN
         raise ValueError(f'the recording does not show the noise at throttle {throttle:g}')
     values: dict[str, Any] = {'battery_voltage': flight.level, **given}
     if flight.resistance > 0.0:
-        # The current and the noise are those of the recorded resistance, not of a changed one.
+        # Current and noise are computed with the recorded resistance, not with a given one.
         values['battery_resistance'] = flight.resistance
     network = PowerNetwork(**completed(values))
     seen = (u >= max(_FROM, low)) & (u <= high) & (sag > 0.0)
@@ -517,7 +517,7 @@ def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerN
     if flight.var_inf > slow:
         slow, rate = min(flight.var_inf, rms ** 2), flight.alpha
     if throttle == 1.0:
-        # No ESC switches at full throttle.
+        # At full throttle no ESC switches, so all of the noise counts as slow.
         slow = rms ** 2
     quiet = replace(network, switching_scale=0.0, flutter=0.0, flutter_rate=rate)
     base = rail_at(quiet, throttle).var_inf

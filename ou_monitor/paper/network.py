@@ -54,7 +54,7 @@ SOURCES = ('switching', 'flutter', 'mcu')
 
 
 def completed(values: dict[str, Any]) -> dict[str, Any]:
-    """Return components with derived values: battery voltage from cells, rail of a 1S craft."""
+    """Fill in the battery voltage from cells, and the regulator voltage of a 1S craft."""
     found = dict(values)
     if found.get('cells'):
         found.setdefault('battery_voltage', NOMINAL_CELL * found['cells'])
@@ -82,9 +82,9 @@ class PowerNetwork:
     # series have 20..40 mOhm).
     bulk_capacitance: float = _part(470e-6, 'F')
     bulk_esr: float = _part(0.03, 'Ohm', zero=True)
-    # Mean current of the motors is current_max * throttle**current_exponent, A; 4 x 30 A,
-    # exponent 1..3 (typical values; 1.5 puts the most ripple at a throttle of 2/3,
-    # recordings show 0.65..0.75).
+    # Mean current of the motors is current_max * throttle**current_exponent, A; 4 x 30 A, exponent
+    # 1..3 (typical values; 1.5 puts the largest ripple at a throttle of 2/3; in recordings it is
+    # at 0.65..0.75).
     current_max: float = _part(120.0, 'A')
     current_exponent: float = _part(1.5)
     escs: int = _part(4)  # ESCs that switch independently.
@@ -142,7 +142,7 @@ class PowerNetwork:
 
     @property
     def line_feedthrough(self) -> float:
-        """Gain of the regulator from its input to its output above its bandwidth."""
+        """Gain from the regulator's input to its output above its bandwidth."""
         if self.line_gain is None:
             return self.regulator_voltage / self.battery_voltage
         return self.line_gain

@@ -65,7 +65,7 @@ class Printed:
 
     @property
     def ends(self) -> Range:
-        """All values that would be printed like this."""
+        """Range of values that would be printed like this."""
         if self.text[0] == '>':
             return math.nextafter(self.value, math.inf), math.inf
         if self.text[0] == '<':
@@ -155,7 +155,7 @@ class ReadingStep:
         return 0.5 * (self.low + self.high)
 
     def around(self, reading: Printed) -> Range:
-        """Return half a step each way of a reading."""
+        """Return the range of half a step either side of a reading."""
         return reading.value - 0.5 * self.size, reading.value + 0.5 * self.size
 
 
@@ -192,7 +192,7 @@ class PrintedLoad:
 
     @property
     def vrms_range(self) -> Range:
-        """Return the range of Vrms, half a step of the oscilloscope either way, mV."""
+        """Return the range of Vrms, half a step of the oscilloscope either side, mV."""
         return VRMS_STEP.around(self.vrms)
 
     @property

@@ -31,7 +31,8 @@ from ou_monitor.text import number
 from scipy.signal import welch
 
 Progress = Callable[[float], None]
-# Simulated segments of 0.5 s (95 % quantile within 0.03), and simulated seconds with jumps.
+# Number of simulated segments of 0.5 s, which gives the 95 % quantile to within 0.03; simulated
+# time with jumps, s.
 CREST_PATHS, JUMP_SECONDS = 4000, 100.0
 # Sections in the order of the paper.
 _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4.4',
@@ -348,7 +349,7 @@ class SimulatedSpectrum:
     # Frequency, Hz, and density, V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
     frequency: FloatArray
     density: FloatArray
-    coupled: FloatArray  # Of the same OU through an AC coupling of 10 Hz, V^2/Hz; shape (k,)
+    coupled: FloatArray  # Density of the same OU behind an AC coupling of 10 Hz
 
 
 def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
@@ -367,7 +368,7 @@ def _screen(state: published.PrintedLoad, rng: np.random.Generator) -> Screen:
 
 
 def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> SimulatedSpectrum:
-    """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
+    """Return the spectrum of a simulation at 1 MHz, evenly spaced on a log axis."""
     t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     ou = OU(published.ALPHA.value, state.sigma, 0.0)
     plain = _density(simulate(t, ou.alpha, ou.sigma, rng))

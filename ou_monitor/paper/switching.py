@@ -25,8 +25,9 @@ WHERE = 'Section 3.3'
 RATE, SPEED = 1000.0, 1.0
 # Multiplicative noise dU = +-GROWTH U dt, 1/s; the limit's error is GROWTH^2 / (4 RATE^2).
 GROWTH = 100.0
-# An example, since the paper gives only alpha: rates, 1/s and rad/s; two states that switch like
-# an ESC of 24 kHz, with each coefficient +-30 % about its mean.
+# Example coefficients, because the paper gives only alpha: damping and coupling, 1/s, and carrier,
+# rad/s. The two states switch like an ESC at 24 kHz; each coefficient is 30 % above or below its
+# mean.
 DAMPING, COUPLING, CARRIER = 100.0, 40.0, 2.0 * math.pi * 10.0
 _SWING = np.array([1.3, 0.7])
 

@@ -6,8 +6,8 @@ every row sums to zero.  Every state must be reachable from every other: then th
 (pi Q = 0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding
 times are exponential; the next state is drawn in proportion to the rates of the present one.
 
-A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t).  Two scalings of
-the paper, both with a small eps; at eps = 1 the system is unchanged, and D and d are not sped up:
+A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t). The paper has two
+scalings with a small eps. Neither speeds up D and d, and eps = 1 leaves the system unchanged:
 
 - averaging (eq. 1): clock 1/eps, speed 1; u^eps -> the averaged system.
 - diffusion (eq. 3): clock 1/eps^2, speed 1/eps, for A, a of zero average: the paths tend in law to
@@ -54,9 +54,9 @@ def augmented(matrix: npt.ArrayLike, offset: npt.ArrayLike) -> FloatArray:
 
 def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray) -> FloatArray:
     """Move m states along their affine systems (1/s), each for its own time tau, s."""
-    # Taylor series of the exponential acting on the state, to the last digit, in substeps of norm
-    # at most 1. It needs no eigenvectors, so it handles a defective matrix too. Very long steps
-    # use the matrix exponential.
+    # Taylor series of the exponential acting on the state, to double precision, in substeps of
+    # norm at most 1. It needs no eigenvectors, so it handles a defective matrix too. Very long
+    # steps use the matrix exponential.
     if not u.size:
         return u.copy()
     step = tau[:, None]
@@ -190,8 +190,8 @@ ROW_TOLERANCE = 1e-9
 class Generator:
     """Generator of an irreducible Markov chain on a finite number of states."""
 
-    # Rates, 1/s; read-only. The diagonal is set to minus the sum of the row's other rates, to the
-    # last digit; shape (n, n).
+    # Rates, 1/s; read-only. The diagonal is set to exactly minus the sum of the row's other rates;
+    # shape (n, n).
     q: FloatArray
 
     def __post_init__(self) -> None:
@@ -267,7 +267,7 @@ class Generator:
     ) -> Iterator[tuple[int, IntArray | slice, IntArray, FloatArray]]:
         """Advance an ensemble of paths from jump to jump, stopping at every edge, s."""
         # Yields, at each jump and edge: index of the interval, the paths that jump (at an edge:
-        # all), their states until then, and the time in these since their last yield, s.
+        # all), their states until then, and the time spent in these since the last yield, s.
         rates, everyone = self.leaving, slice(None)
         kernel = np.cumsum(self.jump_probabilities, axis=1)
         # Each row ends at exactly 1.
@@ -389,7 +389,7 @@ class SwitchedSystem:
         return AffineSystem(self.drift_matrix + matrix, self.drift_offset + offset)
 
     def scaled(self, eps: float, scaling: Scaling) -> SwitchedSystem:
-        """Return the system at eps, with scaled rates and with the unswitched part merged."""
+        """Return the system at eps, with the unswitched drift merged into the matrices."""
         if not 0.0 < eps < np.inf:
             raise ValueError(f'eps must be positive and finite, got {eps}')
         if scaling not in get_args(Scaling):

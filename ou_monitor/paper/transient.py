@@ -27,8 +27,8 @@ WHERE = 'Fig. 5'
 # Corner of the AC coupling of many hand-held oscilloscopes, Hz.
 CORNER_HZ = 10.0
 CORNER = 2.0 * math.pi * CORNER_HZ
-# Rates of rails fitted through the coupling, 1/s.  For comparison: 470 uF with 30 mOhm ESR behind
-# a battery of 40 mOhm relaxes at 3e4 1/s.
+# Relaxation rates of the rails that are simulated behind the coupling, 1/s. For comparison: 470 uF
+# with 30 mOhm ESR behind a battery of 40 mOhm relaxes at 3e4 1/s.
 RAILS = (500.0, 1000.0, 2000.0, 5000.0)
 TYPICAL_RAIL = 1000.0
 # A simulated release: sampling rate, Hz, time under load and time recorded after it, s.
@@ -60,7 +60,7 @@ class LogLine:
 
 
 def fit_log_line(time: FloatArray, value: FloatArray) -> LogLine:
-    """Fit an exponential the paper's way (time in s)."""
+    """Fit an exponential as the paper does (time in s)."""
     y = np.log(np.abs(value))
     line = stats.linregress(time, y)
     scatter = math.sqrt(float(np.sum((y - line.intercept - line.slope * time) ** 2))
@@ -127,12 +127,12 @@ def offset_test() -> tuple[float, float]:
 
 
 def local_rates() -> FloatArray:
-    """Return the rate between each two neighbouring points of Fig. 5, 1/s."""
+    """Return the rates between neighbouring points of Fig. 5, 1/s."""
     return np.asarray(-np.diff(np.log(VALUE)) / np.diff(TIME))
 
 
 def through_coupling(time: FloatArray, rail: float) -> FloatArray:
-    """Return the response of a rail, 1/s, to a unit step, behind the high-pass (time in s)."""
+    """Return a rail's step response behind the high-pass (rail: rate, 1/s; time in s)."""
     return np.asarray(rail / (rail - CORNER) * (np.exp(-CORNER * time) - np.exp(-rail * time)))
 
 
@@ -158,15 +158,15 @@ def fitted_rate(rail: float) -> float:
 
 
 def slowest_rail() -> float:
-    """Return the lowest rate of a rail behind a 10 Hz coupling that agrees with Fig. 5, 1/s."""
+    """Return the lowest rate, 1/s, at which a rail behind a 10 Hz coupling agrees with Fig. 5."""
     least = PAPER_FIT.alpha - PAPER_FIT.half_width
     return float(brentq(lambda rail: fitted_rate(rail) - least, 70.0, 1e5))
 
 
 def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
-    """Return rates of simulated load releases behind the coupling, by the paper's fit, 1/s."""
-    # One row per rail.  Each is an OU whose noise is half a step of the oscilloscope (the most
-    # that is read as "~0"); points are 0, 10, 25 and 35 ms after the peak of the noiseless trace.
+    """Return the rates, 1/s, that the paper's fit gives for load releases behind the coupling."""
+    # One row per rail. Each is an OU whose noise is half a step of the oscilloscope (the most that
+    # is read as "~0"); points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE
     throttle = np.where(t <= _HOLD, published.TRANSIENT_LOAD, 0.0)
     sag = 1e-3 * VALUE[0]
