@@ -108,7 +108,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
 def _fine_unit(stamps: npt.NDArray[Any], masked: npt.NDArray[np.bool_] | np.bool_) -> str:
     """Return 'ms', 'us' or 'ns' if all stamps are dates since 1970 in that unit, else ''."""
     most = float(stamps.max(initial=0))
-    # A NaN among the stamps makes this false; the finite ones are checked below.
+    # If a stamp is NaN this is false, and the finite stamps are checked below.
     if most <= MOST_STAMP:
         return ''
     known = stamps[np.isfinite(stamps) & ~masked]
@@ -379,7 +379,7 @@ class Estimate:
     counters: Counters = field(default_factory=Counters)
 
     def __post_init__(self) -> None:
-        """Make every parameter NaN whose error exceeds `LARGEST_LOG_SE`."""
+        """Make parameters NaN if their errors exceed `LARGEST_LOG_SE`."""
         wide = [name for name in LOG_NAMES if getattr(self, name + '_se') > LARGEST_LOG_SE]
         if not wide:
             return

@@ -56,7 +56,7 @@ LOADS = ((0.0, 0.0), (10.0, 0.0), (10.0, 0.05), (20.0, 0.05), (20.0, 0.10), (30.
 
 def through(points: Sequence[tuple[float, float]], period: float | None = None,
             stick_rate: float | None = None) -> Profile:
-    """Return lines through points (s, 0..1), optionally periodic (s), in steps (at a rate, Hz)."""
+    """Return a profile through points (s, 0..1); period in s; stick_rate: rate of steps, Hz."""
     return partial(_through, np.array(points, dtype=np.float64).T, period, stick_rate)
 
 
@@ -163,7 +163,7 @@ def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
     path = Path(text)
     if text in PROFILES or not path.exists():
         return False
-    # A table without voltage is a profile: times from 0 s, linear between.
+    # A table without a voltage is a profile: points in time, linear between them.
     table = path.suffix.lower() == '.csv' or kind_of(path) == CSV
     return not table or holds_supply(path, columns)
 
@@ -190,7 +190,8 @@ def recorded_throttle(recording: Recording, name: str, full: float = 0.0) -> Rec
         raise InputError(f"--throttle '{name}': the recording has no throttle: name its column or "
                          'series with --throttle-column')
     t, u = recording.t[known] - recording.t[0], recording.throttle[known]
-    # The reader has refused percent and pulses; calibrated sticks may slightly exceed 0..1.
+    # The reader has already refused percent and pulses; calibrated sticks may slightly exceed
+    # 0..1.
     return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)), duration, recording)
 
 
@@ -270,7 +271,7 @@ LARGEST = 1e9
 
 
 class RunningSupply:
-    """A running simulation: sample k is at k/rate (Hz); charge, resistance: see `Simulation`."""
+    """A running simulation: sample k is at k/rate, s; charge, resistance: see `Simulation`."""
 
     def __init__(self, model: SupplyModel, *, rate: float, seed: int,
                  charge: float | None = None, resistance: float = 1.0) -> None:

@@ -1,5 +1,5 @@
 """
-The time line: samples of any source in order of time, each reading once; dropped ones are counted.
+Put the samples of any source in order of time, each reading once, and count dropped samples.
 
 Node, estimator and offline reading share these rules:
 
@@ -60,7 +60,7 @@ _TRIED = 40
 # Minimum period when all changes have one size, samples: a ripple of one ADC code also changes
 # every two or three samples.
 _ONE_CODE = 4.0
-# Samples, from the middle of a recording, in which its period is searched.
+# Number of samples, from the middle of a recording, in which the period is searched.
 _MIDDLE = 200_000
 
 
@@ -286,7 +286,7 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 
 def readings_of(recording: Recording) -> Recording:
-    """Return a recording without repeats of a reading and the sign of reverse; notes say so."""
+    """Return a recording without repeated readings and without the sign of a reverse throttle."""
     recording = _unsigned(recording)
     places, t, period = new_readings(recording.t, recording.voltage)
     if period <= 1.0:
@@ -297,7 +297,7 @@ def readings_of(recording: Recording) -> Recording:
 
 
 def _unsigned(recording: Recording) -> Recording:
-    """Return a recording with the size of its throttle if that predicts the voltage better."""
+    """Return a recording with the absolute throttle if that predicts the voltage better."""
     u = recording.throttle
     known = np.isfinite(u) & np.isfinite(recording.voltage)
     if not np.count_nonzero(u < -_REVERSE) > _REVERSE * recording.n:
@@ -399,8 +399,8 @@ OFF, _ON = 0.2, 0.7
 # Maximum reading, as a multiple of the usual voltage (6S after 5 V of USB: 5).
 WILD_FACTOR = 20.0
 # Maximum number of outages, or this share of the samples if it is more; the share is also the
-# maximum of wild readings.  Maximum share of samples off; maximum ratio of samples between the two
-# limits to samples below the lower one.
+# maximum share of wild readings. Maximum share of samples off; maximum ratio of samples between
+# the two limits to samples below the lower one.
 _OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0
 # Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6

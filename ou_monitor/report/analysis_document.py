@@ -72,7 +72,7 @@ def answer(analysis: Analysis) -> list[str]:
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
         f'{_why_no_throttle(analysis)}.']
     supply = [first, *safe, *others, *craft_advice(analysis.craft)]
-    # If the voltage has the wrong sign, only its noise has a meaning; a stuck sensor has none.
+    # If the voltage has the wrong sign, only its noise is meaningful; if it is stuck, nothing is.
     meaningless = {item.name for item in faults(analysis.recording)} & {'VOLTAGE_SIGN', 'STUCK'}
     return [*analysis.overview.beware, *([] if meaningless else supply),
             *_numbers(analysis), *_change(analysis)]
@@ -128,7 +128,7 @@ def _budget(analysis: Analysis) -> str:
 
 
 def _fall_within_budget(analysis: Analysis) -> str:
-    """Return in words that the voltage fell below the limit within the budget, or ''."""
+    """Return in words a fall below the limit at a throttle within the budget, or ''."""
     recording, dips = analysis.recording, analysis.overview.facts.dips
     if dips is None:
         return ''
@@ -169,7 +169,8 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
 
 
-# Minimum ratio of the noise to its median at steady throttle that is more than their errors.
+# Ratio of the relaxation's rms to the median noise at steady throttle above which both are
+# reported.
 _MIXED = 1.2
 
 

@@ -73,7 +73,7 @@ def _time(value: float) -> str:
 
 def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed: bool,
                 origin: str) -> str:
-    """Return the values taken from a flight, and the missing ones (origin: of the cells)."""
+    """Return in words what was taken from a flight, and what is missing (origin: of the cells)."""
     cells = f'{counted(network.cells, "cell")} ({origin})' if network.cells else (
         'taken as a rail, whose regulator is a constant voltage behind a resistance')
     regulator = '' if network.regulator_voltage else (

@@ -206,7 +206,7 @@ def _head(text: str) -> str:
 
 
 def html(document: Document, command: str = '') -> str:
-    """Return a document as a self-contained page (command: makes it again)."""
+    """Return a document as a self-contained page (command: makes the page again)."""
     body = _joined(document.parts)
     if command:
         again = f'<p><code>{escape(command)}</code></p>'

@@ -151,7 +151,7 @@ class Curve:
     x: FloatArray
     y: FloatArray
     high: FloatArray | None  # Upper edge of a band, upper ends of bars; shape (n,)
-    label: str  # Name in the legend; empty without an entry
+    label: str  # Name in the legend; empty: no entry
     # CSS classes; the first is ``s0`` .. ``s7``, the colour.
     style: str
     kind: str  # ``line``, ``steps``, ``band``, ``markers`` or ``bars``
@@ -214,7 +214,7 @@ class Plot:
         return self._add('bars', x, low, high, label, colour)
 
     def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
-        """Shade a span of the x axis; its label is drawn where there is room."""
+        """Shade a span of the x axis; its label is drawn if there is room."""
         self.shades.append((start, stop, f's{colour % SERIES}', label))
         return self
 
@@ -277,7 +277,8 @@ class Plot:
         for where, label in sorted(self.marks):
             pixel = float(x(where))
             if _LEFT <= pixel <= right:
-                # Near the right edge, left of its line; below earlier labels that it would cover.
+                # Near the right edge, put the label left of its line; below earlier labels that it
+                # would cover.
                 width = _LETTER * len(label)
                 start = pixel + 4.0 if pixel + 4.0 + width <= right else pixel - 4.0 - width
                 row = next((k for k, end in enumerate(ends) if end <= start), len(ends))

@@ -1,1 +1,1 @@
-"""Messages, as msg_config/*.yaml describes them -> samples; reading and writing of user files."""
+"""Turn messages (described by msg_config/*.yaml) into samples; read and write user files."""

@@ -1,5 +1,5 @@
 """
-Read `msg_config/*.yaml`: topic, type and field of a voltage.
+Read `msg_config/*.yaml`: topic, type and field of voltage, throttle, current and motor speeds.
 
 One file describes one source (an autopilot bridge, an ADC driver); a new message type needs a new
 file and no code.  An error in a file is one line with the file, the key and the nearest valid key.
@@ -257,7 +257,7 @@ def put(msg: object, steps: FieldPath, value: Any) -> None:
 
 
 class ManyExtractor:
-    """Extracts numbers: one, an array, or a field of each element, 'esc[].esc_rpm'."""
+    """Extracts numbers: one, an array, or a field of each element (such as 'esc[].esc_rpm')."""
 
     def __init__(self, spec: FieldSpec) -> None:
         self.spec = spec

@@ -1,5 +1,5 @@
 """
-Messages -> samples in order, throttle beside each, ready for the monitor.
+Turn messages into ordered samples, each with its throttle, for the monitor.
 
 Publishers: rclpy does not report the sender, so publishers are distinguished by the sequence
 numbers of their messages; two with equal numbers and times cannot be distinguished.
@@ -10,9 +10,9 @@ at each throttle message, with the newest voltage stamp received by then.  A thr
 maximum age; the caller knows the present time and decides when it is too old.  Samples handed to
 the monitor are final: a throttle that arrives later applies to later samples only.
 
-Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, late by some
-milliseconds of bus and scheduler that vary from block to block.  The samples themselves are timed
-by a quartz, so their time line runs at the stated rate and follows the stamps only slowly.  A
+Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, which bus and
+scheduler delay by some milliseconds that vary from block to block. The samples themselves are
+timed by a quartz, so their time line runs at the stated rate and follows the stamps only slowly. A
 constant delay is not corrected; one lost block (within max(2 blocks, 0.25 s)) looks like jitter:
 it is not counted as a gap, and the time line catches up slowly.
 """
@@ -41,7 +41,7 @@ AHEAD, BEHIND = 0.25, 5.0
 MOST_DELAY = 600.0
 # Silence of the followed publisher, s, after which another one is followed.
 GIVE_UP = 1.0
-# Silence, in message intervals, that may be a pause of the publisher rather than a loss.
+# Minimum silence, in message intervals, that may be a pause of the publisher rather than a loss.
 PAUSE = 10.0
 # Maximum number of tracks, beyond the number of publishers, within a batch.
 _MORE = 4
@@ -84,15 +84,15 @@ class _Track:
     interval: float = math.nan
 
     def deviation(self, number: int, time: float) -> float:
-        """Return the deviation of a message from this publisher's expected number, messages."""
+        """Return how far a message's number is from the one expected of this publisher."""
         if number <= self.number or time < self.time:
             return math.inf
         step = number - self.number
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # After a silence, messages were lost, or none was sent; assume the second only if it fits
-        # better by half a message.
+        # A silence means lost messages or a pause; assume a pause only if it fits better by half a
+        # message.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:
@@ -138,7 +138,7 @@ class Publishers:
     def _give_up(self, publishers: int) -> None:
         """After a whole batch, forget publishers that are gone, and if need be follow another."""
         while len(self._tracks) > max(publishers, 2):
-            # A publisher has restarted: the one that has been silent longest is gone.
+            # A publisher has restarted: drop the track that has been silent longest.
             gone = min(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)
             del self._tracks[gone]
             if gone == 0:
@@ -156,7 +156,7 @@ class Publishers:
             len(self._tracks) < publishers and off[best] > 0.5 * max(
                 10, self._tracks[best].number))
         if new and publishers <= 1 and len(self._tracks) == 1:
-            # The only publisher has started again.
+            # The only publisher has restarted.
             self._tracks = [_Track(number, time, arrived, self._tracks[0].interval)]
             return True
         if new:
@@ -315,7 +315,7 @@ class ThrottleHold:
         return found
 
     def forget_before(self, t: float) -> None:
-        """Drop the values that no sample from `t` (s) on can need."""
+        """Drop the values that samples from `t`, s, on do not need."""
         places, values = self.held()
         past = max(int(np.searchsorted(places, t + self._slack, 'right')) - 1, 0)
         self._places, self._values = [places[past:]], [values[past:]]
@@ -338,7 +338,7 @@ class SampleStream:
     Collects samples between two reports for the monitor; `flush` pairs them with the throttle.
 
     `messages`: number of voltage messages; `unplaced`: number without a time (`/clock` has not
-    started), checked against the voltage floor only; one of `thin` samples enters the estimate.
+    started), checked against the voltage floor only; one in `thin` samples enters the estimate.
     """
 
     def __init__(self, monitor: SupplyMonitor) -> None:
