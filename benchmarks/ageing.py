@@ -1,11 +1,12 @@
 """
-Verdicts of comparing a flight with a saved model: aged packs, recorded pairs (5 min per model).
+Verdicts on flights compared with a saved model: aged packs, recorded pairs (5 min per model).
 
 `aged`: a model is learned from one simulated flight and compared with 60 s of others, which have
 1, 1.1, 1.2 and 1.4 times the sag and start at three places of the recorded throttle, and with 6 s
-at three quarters of the voltage.  A verdict at any second counts, not only the last. `pairs`:
-recorded flights of one craft, or halves of one, each compared with the model of the other: at the
-last sample, and whether WEAKER at any second.  Needs `OU_MONITOR_REALDATA`.
+at three quarters of the voltage. A verdict at any second counts, not only the last. `pairs`: two
+recorded flights of one craft, or the halves of one flight, are each compared with the model of the
+other; the verdict at the last sample is reported, and whether it was WEAKER at any second. Needs
+`OU_MONITOR_REALDATA`.
 
     python benchmarks/ageing.py aged models/gecko.yaml:bags/recorded/gecko.csv --page PAGE
 """

@@ -1,12 +1,13 @@
 """
 The brown-out flag on recorded flights, beside the battery alarms of PX4 and ArduPilot (8 min).
 
-Each limit has its own monitor, with reports at 10 Hz.  Limits: undershot in 1 and 5 % of the
-seconds, and 3.3 and 3.5 V per cell.  A dip: the median of three readings is at or below the limit;
-dips less than 0.3 s apart count as one.  Caught: the alarm is on at some time from 2 s before the
-dip begins to 0.25 s after; its lead is measured from the first such report.  Lone: no other dip in
-the 4 s before.  Quiet: at least 2 s away from any dip.  A false rise: no dip follows within 2 s.
-Limits that the voltage undershoots for more than 30 % of the flight are left out.
+Each limit has its own monitor, with reports at 10 Hz. Limits: those that the voltage undershoots
+in 1 and 5 % of the seconds, and 3.3 and 3.5 V per cell. A dip: the median of three readings is at
+or below the limit; dips less than 0.3 s apart count as one. Caught: the alarm is on at some time
+from 2 s before the dip begins to 0.25 s after; its lead is measured from the first such report.
+Lone: no other dip in the 4 s before. Quiet: at least 2 s away from any dip. A false rise: no dip
+follows within 2 s. Limits that the voltage undershoots for more than 30 % of the flight are left
+out.
 
 The autopilots' alarms, with their defaults and the cells of the pack, are taken to be on while
 their condition holds, although both latch them until landing.  Without a current neither

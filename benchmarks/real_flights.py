@@ -2,8 +2,8 @@
 The load model on recorded flights: share of the voltage explained by throttle (2 min).
 
 Simulated ahead: the model is fitted to the first half and predicts the second from its throttle;
-offset included.  One second ahead: predictions by the filter in the second half, given the
-throttle of that second.
+an offset of the prediction counts as error. One second ahead: predictions by the filter in the
+second half, given the throttle of that second.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LOOK = 0.1
 
 
 def explained(voltage: np.ndarray, predicted: np.ndarray) -> float:
-    """Return the share of variance explained, offset included."""
+    """Return the share of variance explained; an offset counts as error."""
     return 1.0 - float(np.sum((voltage - predicted) ** 2) / np.sum(
         (voltage - voltage.mean()) ** 2))
 

@@ -1,9 +1,9 @@
 """
 Simulated samples per second, against other ways to draw an OU process (1 min).
 
-All ways run in turn, `--repeats` times; the least CPU time of each counts.  Ours also makes stamps
-and throttle for each piece, as `ou-monitor simulate` does.  The ratio of the variance to the OU
-process's own shows whether the distribution is right.
+All ways run in turn, `--repeats` times; the least CPU time of each counts. The package also makes
+stamps and throttle for each piece, as `ou-monitor simulate` does. The ratio of the variance to the
+OU process's own shows whether the distribution is right.
 """
 
 from __future__ import annotations

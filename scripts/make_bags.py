@@ -3,8 +3,8 @@
 Write the library of bags: `scripts/make_bags.py [FOLDER]` (default: bags/).
 
 Each is a rosbag2 directory with a `truth.yaml`, the parameters of its simulation, against which an
-estimate can be checked.  The same seed gives the same messages.  Parameters are those of the
-paper's Tables 1 and 2 unless said otherwise.
+estimate can be checked. The same seed gives the same messages. Parameters are from the paper's
+Tables 1 and 2 unless stated otherwise.
 """
 
 from __future__ import annotations
