@@ -14,7 +14,8 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import driven, Events, fit_gaussian, GaussianFit, white_noise
+from ou_monitor.criticism.structure import (
+    driven, Events, fit_gaussian, GaussianFit, slope_of_lines, white_noise)
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.records import FloatArray
@@ -134,4 +135,5 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
                 state=np.concatenate(([0.0], residual[:-1])), residual=residual,
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
                 train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
-                driven=np.clip(s.added / gaussian.variance, 0.0, 1.0))
+                driven=np.clip(s.added / gaussian.variance, 0.0, 1.0),
+                slope=slope_of_lines(samples, gaussian.terms))

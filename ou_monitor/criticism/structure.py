@@ -18,6 +18,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import JitterOnLines
 from ou_monitor.model.terms.segment import Segment
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tones import Tone
@@ -176,6 +177,7 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
     whole = s
     if events is None and samples.n > _SETTLES and samples.even and not any(
             term.ROLE is Role.DRIVE or (term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE)
+            or isinstance(term, JitterOnLines)
             for term in terms):
         s = _first(s, _SETTLES)
     n = s.t.size
@@ -221,7 +223,19 @@ def driven(samples: Samples, terms: Sequence[Term]) -> Segment:
 
 def white_noise(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
     """Return the variance of white noise in each sample of a segment, V^2; shape (n,)."""
+    if any(isinstance(term, JitterOnLines) for term in terms):
+        s.slope = slope_of_lines(samples, terms)
     return np.full(s.t.size, samples.blur) + sum(term.variances(s) for term in terms)
+
+
+def slope_of_lines(samples: Samples, terms: Sequence[Term]) -> FloatArray:
+    """Return the slope of the lines without a wandering phase, V/s; shape (n,)."""
+    slope = np.zeros(samples.n)
+    for term in terms:
+        if isinstance(term, Tone) and term.ROLE is Role.MEAN:
+            a, b = term.linear_values()
+            slope += 2.0 * math.pi * term.frequency * (samples.columns(term) @ np.array([-b, a]))
+    return slope
 
 
 def _first(s: Segment, n: int) -> Segment:

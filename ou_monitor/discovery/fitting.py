@@ -163,10 +163,12 @@ class Fitter:
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
-            if kind.ROLE is Role.LAW and not self._finds_events(kind, view):
+            # A law that has starting points is fitted as another term of its name.
+            starts = kind.candidates(view) if kind.ROLE is Role.LAW else None
+            if starts == () and not self._finds_events(kind, view):
                 gain, start = self._law_gain(kind, view), None
             else:
-                start = self.best_start(composite, kind, view, least)
+                start = self.best_start(composite, kind, view, least, starts)
                 gain = -math.inf if start is None else self.evidence(start) - before
             # Keep kinds that gain less than others: a full fit may reverse the order.
             if gain > (least if kind.BROAD else 0.0):
@@ -187,8 +189,8 @@ class Fitter:
                             start or composite)
             if start is not None and (full is None or self.evidence(full) < self.evidence(start)):
                 full = start
-            if full is not None and (full.terms[-1] if kind.ROLE is Role.LAW else _added_term(full)
-                                     ).holds(self.view(composite)):
+            if full is not None and [term for term in full.terms if term.NAME == kind.NAME][
+                    -1].holds(self.view(composite)):
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
                 found.append(Trial(
                     kind.NAME, full, self.evidence(full) - self.evidence(composite),
@@ -224,7 +226,7 @@ class Fitter:
                    starts: Sequence[Term] | None = None) -> Composite | None:
         """Return the best fit with one more term of a kind (starts: its candidates by default)."""
         # least: nats that its spectrum must gain.
-        if kind.ROLE is Role.LAW:
+        if kind.ROLE is Role.LAW and not starts:
             found = self.fit([*composite.terms, kind], composite, rough=True)
             return found if found is not None and found.terms[-1].holds(view) else None
         starts = list(kind.candidates(view)) if starts is None else list(starts)

@@ -126,6 +126,21 @@ def test_laws_are_fitted_where_steps_are_long(law, alpha):
     assert abs(score(simulated.z[1:], state[1:]**3)) < FAR
 
 
+@pytest.mark.parametrize('noise', [0.0, 0.01])
+def test_jitter_that_only_a_line_shows_is_named(noise):
+    """Errors of the stamps look like white noise, but only where the line is steep."""
+    rng, n, rate, std = np.random.default_rng(8), 9000, 150.0, 5e-4
+    t = np.arange(n) / rate
+    true = t + std * rng.standard_normal(n)
+    voltage = (5.0 + rail(rng, n, 20.0, rate, 0.02) + noise * rng.standard_normal(n)
+               + 0.3 * np.sin(2.0 * np.pi * 17.3 * true))
+    finding = discover(Recording(t, voltage, None))
+    found = {cause.name: cause.term for cause in finding.causes}
+    assert set(found) == {'tone', 'clock_jitter', *(('measurement_noise',) if noise else ())}
+    # 9000 squares, half of them informative: 2 % by chance.
+    assert found['clock_jitter'].std == pytest.approx(std, rel=0.08)
+
+
 def test_a_sag_behind_an_ac_coupling_is_named():
     """The mean answers to changes only: transients say so too, but not what the noise says."""
     rng, n, rate = np.random.default_rng(7), 12000, 200.0

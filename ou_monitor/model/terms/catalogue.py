@@ -35,7 +35,7 @@ def catalogue() -> Mapping[str, type[Term]]:
     for info in iter_modules(folder.__path__):
         module = import_module(f'{folder.__name__}.{info.name}')
         for value in vars(module).values():
-            if (isinstance(value, type) and issubclass(value, Term) and value.NAME
+            if (isinstance(value, type) and issubclass(value, Term) and vars(value).get('NAME')
                     and value.__module__ == module.__name__):
                 found[value.NAME] = value
     found = {'ou': found.pop('ou'), **dict(sorted(found.items()))}

@@ -302,6 +302,19 @@ class ClockJitter(Term):
         return effect
 
     @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return a starting point for errors that show on the slopes of lines."""
+        square = np.square(np.broadcast_to(view.slope, view.z.shape)[view.train])
+        usual = float(square.mean())
+        if not float(square.std()) > 0.0:
+            return ()
+        # Score test: whether the errors are larger where the lines are steeper.
+        x, e = square - usual, np.square(view.z[view.train])
+        score = float(x @ e) / (math.sqrt(x.size) * float(x.std()) * float(e.std()))
+        std = math.sqrt(float(np.median(view.variance)) / (2.0 * usual))
+        return [JitterOnLines(min(std, 0.4 / view.rate))] if score > _STEEPER else ()
+
+    @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit the hidden errors of the stamps, which show because longer steps add more noise."""
         return cls._best_fit(view, [math.log(0.2), 0.0], 40)
@@ -340,6 +353,27 @@ class ClockJitter(Term):
         error = math.exp(x[0]) * step
         return LawFit(cls(error), {'std': error * float(curvature_se(value, x)[0])}, scores,
                       density - log_normal(view.z), 2)
+
+
+@dataclass(frozen=True)
+class JitterOnLines(ClockJitter):
+    """The same errors where lines show them: as white noise in proportion to their slopes."""
+
+    ROLE: ClassVar[Role] = Role.NOISE
+    FREE: ClassVar[tuple[str, ...]] = ('std',)
+
+    def holds(self, view: View) -> bool:
+        """Return whether samples keep their order, so that the errors are of the stamps."""
+        return self.std * view.rate < _MOST_ERROR
+
+    def variances(self, s: Segment) -> FloatArray:
+        """Return the variance at each sample, V^2."""
+        return np.square(self.std * s.slope)
+
+
+# Maximum standard deviation of the errors of stamps, in steps; minimum score, standard errors, of
+# a fit of errors on lines: half of its square is 6 nats, as evidence needs.
+_MOST_ERROR, _STEEPER = 0.45, 3.5
 
 
 def _square_correlation(square: FloatArray) -> float:
