@@ -107,7 +107,7 @@ def test_the_best_first_estimates_are_fitted_in_full():
     rough = {MeasurementNoise: 25.0, LoadDependentSigma: 24.0, Drift: 17.0, Tone: 9.0}
     fitter.view = lambda composite: SimpleNamespace(
         z=np.zeros(9), variance=np.full(9, 1e-4), at=np.array([0.0, 1e3]))
-    fitter.best_start = lambda composite, kind, view, least: Model(
+    fitter.best_start = lambda composite, kind, view, *_: Model(
         [BASE, kinds.get(kind, NOISE)], rough[kind])
     found = fitter.trials(Model([BASE], 10.0), list(rough), lambda model: {})
     assert fitter.asked == [(('measurement_noise',), False), (('load_dependent_sigma',), False)]
