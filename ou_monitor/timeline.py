@@ -47,7 +47,7 @@ _EVIDENCE = 20.0
 _SIZES = 0.1
 # Minimum share of regular gaps to keep a period found earlier.
 _KEEP = 0.8
-# Minimum number of gaps to decide that; with fewer, the period is kept.
+# Minimum number of gaps for this decision; with fewer, the period is kept.
 _FEWEST = 8
 # Relative difference below which two step sizes are equal (float32 rounding).
 _SAME = 1e-3

@@ -219,7 +219,7 @@ class FilterSettings:
         1.0, 'Age of sigma after which the fallback is used, s.', 0.01, 3600.0)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and contradictions."""
+        """Refuse values that are out of range or contradict each other."""
         check_values(self)
         self._check_limits()
         self._check_law()
@@ -363,7 +363,7 @@ class NotchSettings:
         0.25, 'Age of the motor speeds after which throttle is used instead, s.', 0.001, 3600.0)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and contradictions."""
+        """Refuse values that are out of range or contradict each other."""
         check_values(self, 'notch.')
         if RPM_UNITS[self.rpm_unit][1] and (self.poles < 2 or self.poles % 2):
             raise ValueError(

@@ -2,7 +2,7 @@
 Decide whether an input can be trusted, from its stamps, its unit, and whether it is stuck.
 
 `SupplyMonitor` uses `InputTrust`, in the node and offline; the adaptive filter checks its messages
-by the same `StampWatch`, and falls back to arrival times (`InputClock`).
+with the same `StampWatch`, and falls back to arrival times (`InputClock`).
 
 Limits: stamps count as good while at most a tenth of them are late; repeated messages do not count
 as late. Until the reading first changes, a stuck sensor looks like a coarse one, so both count as

@@ -1,1 +1,1 @@
-"""The paper: theory, every number recomputed; the power network, and `design` with it."""
+"""The paper's theory, its numbers recomputed, and the power network that `design` uses."""

@@ -100,7 +100,7 @@ class DesignRow:
 
     @property
     def risk(self) -> float:
-        """Return the larger of the two probabilities; it decides."""
+        """Return the risk that decides: the larger of the two probabilities."""
         return max(self.risk_ou, self.risk_crossing)
 
     @property
@@ -152,7 +152,7 @@ class Design:
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
     sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
-    assumed: bool = False  # Whether the battery resistance is assumed: shares of it are shown.
+    assumed: bool = False  # Whether the battery resistance is assumed, and so shown in %
 
 
 def default_voltage(cells: int, rail: float) -> tuple[float, str]:
@@ -473,7 +473,7 @@ class Flight:
 
     level: float  # Open-circuit voltage at the end of the recording, V
     full: float  # Highest median of half a second, V
-    cells: int  # In series; 0: unknown
+    cells: int  # Cells in series; 0: unknown
     throttle: Sequence[float]  # 0..1, at which the next four fields are given
     sag: Sequence[float]  # V
     sag_se: Sequence[float]  # V

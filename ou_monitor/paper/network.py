@@ -9,10 +9,10 @@ The network is linear about its operating point, dx = A x dt + B dW, and the rai
 c x.  Noise is coloured, with one state per source, so that the variance stays finite where a
 capacitor's ESR (r) turns current directly into voltage.
 
-Limits: leads have no inductance, so edges faster than R/L (0.1 to 1 us) are not modelled.  The
-battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  There
+Limits: leads have no inductance, so edges faster than L/R (0.1 to 1 us) are not modelled. The
+battery is one resistance without polarisation, so recovery over 0.3 s and more is missing. There
 is no LC filter before the regulator, which draws constant power: its input has the incremental
-resistance -V^2/P.  The random part of the ESC current is the Markov switching of the paper, which
+resistance -V^2/P. The random part of the ESC current is the Markov switching of the paper, which
 spreads the power of a regular PWM over all frequencies: an upper bound, unless `switching_scale`
 is set from a measured rail.
 

@@ -155,7 +155,7 @@ class ReadingStep:
         return 0.5 * (self.low + self.high)
 
     def around(self, reading: Printed) -> Range:
-        """Return the range of half a step either side of a reading."""
+        """Return the range of a reading, plus or minus half a step."""
         return reading.value - 0.5 * self.size, reading.value + 0.5 * self.size
 
 
@@ -192,7 +192,7 @@ class PrintedLoad:
 
     @property
     def vrms_range(self) -> Range:
-        """Return the range of Vrms, half a step of the oscilloscope either side, mV."""
+        """Return the range of Vrms, plus or minus half a step of the oscilloscope, mV."""
         return VRMS_STEP.around(self.vrms)
 
     @property

@@ -335,7 +335,8 @@ class SwitchedSystem:
     offsets: FloatArray = field(default_factory=lambda: np.empty(0))
     # D, 1/s: not switched, not sped up; zeros when left out; shape (d, d).
     drift_matrix: FloatArray = field(default_factory=lambda: np.empty(0))
-    drift_offset: FloatArray = field(default_factory=lambda: np.empty(0))  # d, likewise; (d,)
+    # d, unit of u per second; shape (d,)
+    drift_offset: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         """Check the shapes and fill in the zeros."""

@@ -3,8 +3,8 @@ Model files: the terms of a supply as YAML.
 
 `model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the first being `ou`;
 `load:` (optional) holds start values of the load filter; `full_load_a:` (optional) is the current
-at which the load is 1, A, if the load is a current; `provenance:` is free text.
-Written by `discover`, read by `simulate` and by the estimator node.
+at which the load is 1, A, if the load is a current; `provenance:` is free text. `discover` and
+`simulate` write it; `simulate`, `compare` and the nodes read it.
 """
 
 from __future__ import annotations

@@ -280,7 +280,7 @@ def _signed(value: FloatArray) -> FloatArray:
 
 
 def _pair(value: Any) -> tuple[float, float] | None:
-    """Return two rising numbers; None otherwise."""
+    """Return a value as two rising numbers, or None if it is not that."""
     if isinstance(value, list) and len(value) == 2 and all(
             isinstance(x, (int, float)) for x in value) and value[1] > value[0]:
         return float(value[0]), float(value[1])

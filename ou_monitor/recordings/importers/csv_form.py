@@ -64,7 +64,7 @@ DELIMITERS = {'tab': '\t', 'space': ' '}
 # Label before the names of channels.
 _OF_NAMES = re.compile('name|trace|label|channel', re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
-# A number with points or commas between thousands, not a part of a date or a clock.
+# A number with points or commas between thousands, which is not part of a date or a clock.
 _OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
                         for mark in (r'\.', ','))
 _OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?[^",\d]*"')

@@ -119,7 +119,7 @@ def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: F
             unit, t = 'd', t - first
         words = '' if unit == 's' else ', a guess: --time-unit'
     t = t * SCALES[unit]
-    # A stated unit of a minute or more is not mistaken for a finer one; the user's is accepted.
+    # Refuse only s and finer units: a stated minute, or a unit given by the user, is deliberate.
     if usual * SCALES[unit] > LONGEST_STEP and SCALES[unit] <= 1.0 and not wanted.time_unit:
         raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? Give --time-unit")
