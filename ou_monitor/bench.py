@@ -122,7 +122,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
                      brownout_horizon=brownout_horizon, cells=cells, progress=progress)
     facts = found.overview.facts
     if found.brownout_default:
-        # Without a given limit, report no dips and no budget, as the other commands do.
+        # Without a given limit, `supply` has no dips and no budget, as with the other commands.
         facts = replace(facts, dips=None, budget=None)
     return Result(found, partial(analysis_document, found), partial(_analysis_data, found),
                   'levels', facts)
@@ -156,9 +156,9 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     seed : int
         Equal seeds give equal simulations.
     levels : tuple of float
-        Further voltages, V, whose crossings are counted.
+        Further voltages, V, below which dips are counted.
     brownout_voltage, cells
-        As for `analyze`; crossings of that voltage are counted too.
+        As for `analyze`; dips below that voltage are counted too.
     progress : callable, optional
         Called with the share done, 0..1.
 
@@ -344,16 +344,16 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     recording : Recording or path, optional
         Flight that gives level, sag, resistance and noise.
     network : mapping, optional
-        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``. A resistance
-        or voltage that the recording shows is changed to the value given; other values describe
-        the recorded craft.
+        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``.  If the
+        recording shows the resistance or battery voltage, a value given here replaces it, as if
+        the part were exchanged.  Other values describe the recorded craft.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
         Brown-out level, V; on the bus, if `cells` is given, V per cell (by default 3.3).
     cells : int
-        Cells in series; 0: as in the network or the recording.  A recording whose voltage fits no
-        pack, and a network with 0 cells, are rails.
+        Cells in series; 0: as in the network or the recording.  If the network has 0 cells, or the
+        recorded voltage fits no pack, the supply is treated as a rail.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -425,10 +425,10 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if cells:
             check_cells(full, cells)
         else:
-            # The recorded voltage is that of the rail itself.
+            # The recorded voltage is the rail's own.
             rail = 'bus'
         if rail == 'bus':
-            # What a regulator draws is in the recorded voltage.
+            # The recorded voltage already includes the load of a regulator.
             values.setdefault('regulator_voltage', 0.0)
         if voltage is not None:
             level, source = voltage, 'given'
@@ -469,7 +469,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
             risk: float) -> tuple[Flight, SupplyFacts, Callable[..., float] | None]:
-    """Return flight, facts, and the final risk as a function (parameters full and level in V)."""
+    """Return flight, facts, and a function for the risk at the end (full and level in V)."""
     from ou_monitor.analysis.noise import remainder, without_wild
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
@@ -499,10 +499,10 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
             monitor.changed_risk(sag, noise, level - rise), 1e-300)))
 
     def risk_at(throttle: float, sag: float, noise: float, *, share: float, rise: float) -> float:
-        # share: resistance over the recorded one; rise of the battery voltage, V.
+        # share: resistance divided by the recorded one; rise: change of the battery voltage, V.
         risks = over_throttle(share * sag, noise, rise)
         if share < 1.0:
-            # Less resistance cannot raise the risk; with the error of the level it may seem to.
+            # Less resistance cannot raise the risk; the error of the level can make it seem so.
             risks = np.minimum(risks, over_throttle(1.0, noise, rise))
         return float(np.exp(np.interp(throttle, np.linspace(0.0, 1.0, risks.size), risks)))
 
@@ -556,7 +556,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     Parameters
     ----------
     model : SupplyModel or path, optional
-        Model of the supply, or a model file by `discover`.
+        Model of the supply, or a model file written by `discover`.
     preset : str, optional
         Name of a preset, used without a model; by default 'flight'.
     throttle : str, float, Recording, path or callable, optional

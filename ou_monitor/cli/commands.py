@@ -1,4 +1,4 @@
-"""The table of commands with purpose, module and options; a module is imported when it runs."""
+"""The table of commands: purpose, module, options.  A module is imported when its command runs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _DIGITS = 18
 
 
 def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
-    """Return a parser of whole numbers: low to high, multiples of step (what: for the error)."""
+    """Return a parser of multiples of step, low to high (what: wording for the error)."""
     def read(text: str) -> int:
         value = int(text) if text.isascii() and text.isdigit() and len(text) <= _DIGITS else -1
         if not low <= value <= high or value % step:
@@ -115,7 +115,7 @@ def band(text: str) -> tuple[float, float]:
 
 
 def ends(text: str) -> str:
-    """Check a unit of a throttle, or its ends."""
+    """Check a unit of throttle, or LOW:HIGH, the values at zero and full throttle."""
     low, _, high = text.partition(':')
     read = number('1, %, us or the ends LOW:HIGH, such as 364:1684', math.isfinite)
     if text not in ('1', '%', 'us') and read(low) == read(high):
@@ -283,7 +283,7 @@ _COMPARE = Command(
     'compare', 'a recording and simulations of it: the largest difference',
     'ou_monitor.cli.recorded:compare',
     'Simulate a recording many times under its own throttle, and compare: mean path, lowest '
-    'voltage, falls through low levels, spectrum, response to throttle, distribution. '
+    'voltage, dips below low levels, spectrum, response to throttle, distribution. '
     'Without --model, a model is fitted to the part before --fit-until; the rest is simulated.',
     (RECORDING, *PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
@@ -295,8 +295,8 @@ _COMPARE = Command(
      Option('--seeds', metavar='N', type=whole('a whole number, 20 to 10000', 20, 10_000),
             default=50, help='simulations (default: %(default)s)'),
      seed(0, 'same seed, same simulations'),
-     *limit('also count falls through this voltage, V (default: two low levels that the '
-            'recording shows)'),
+     *limit('also count dips below this voltage, V (dips below two low levels of the recording '
+            'are always counted)'),
      *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.mcap --report flight.html', 'flight.bbl --fit-until 60 --cells 4',
      'flight.mcap --model other_day.yaml'))

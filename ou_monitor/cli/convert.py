@@ -1,4 +1,4 @@
-"""`ou-monitor convert LOG OUT`: a log becomes an MCAP bag."""
+"""`ou-monitor convert LOG OUT`: convert a log to an MCAP bag."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert, or list."""
+    """Convert a log, or list its series."""
     if args.list and args.out is not None:
         raise InputError(f"--list writes no bag: leave '{args.out}' out")
-    # Checked before the log is read, which may take long.
+    # Check the outputs first: reading the log may take long.
     check_outputs(args, ('OUT', args.out), LOG=args.log)
 
     from ou_monitor.recordings.importers.formats import import_log

@@ -72,7 +72,7 @@ def read_network(path: str) -> dict[str, Any]:
 
 
 def component(name: str, where: str) -> str:
-    """Return the name of a component if it exists."""
+    """Return the name of a component; raise InputError if there is no such component."""
     valid = [field.name for field in fields(PowerNetwork)]
     if name not in valid:
         raise InputError(f"{where}: unknown component '{name}': {nearest(name, valid)}")

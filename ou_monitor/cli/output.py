@@ -159,7 +159,7 @@ def write_text(text: str, target: str | Path, force: bool = False) -> None:
 
 
 def path_argument(text: str) -> Path:
-    """Return a path given as an argument; an empty one would be the current folder."""
+    """Return a path given as an argument; refuse an empty one (it means the current folder)."""
     if not text:
         raise argparse.ArgumentTypeError('the path is empty')
     return Path(text)
