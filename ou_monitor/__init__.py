@@ -1,8 +1,8 @@
 """
 Noise-aware state estimation for UAV supply rails.
 
-The public names are loaded on first use (PEP 562), so that ``import ou_monitor`` takes no time,
-and the nodes never load the readers of recordings.
+Public names are loaded on first use (PEP 562): ``import ou_monitor`` is fast, and the nodes never
+load the readers of recordings.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@ The voltage of a Linux IIO or hwmon device: polled, or in blocks from the kernel
 
 Limits: file permissions decide what can be read and written; errors say what to do.  A polled
 voltage (hwmon `inN_input`, or IIO `_raw` without a buffer) is as old as the driver's last
-conversion; polling faster than its `update_interval` repeats the number.  Only one program can
-read a buffer, and only one channel is read.  Without a timestamp channel, a block is stamped when
-it is read, later than its last sample by the scheduler's delay.
+conversion; polling faster than `update_interval` repeats readings.  Only one program can read a
+buffer, and only one channel is read.  Without a timestamp channel, the stamp of a block is the
+time at which it was read: its last sample is older by the scheduler's delay.
 
 The kernel's ABI (Documentation/ABI/testing/sysfs-bus-iio, iio_devbuf): a scan holds its elements
 in the order of their indices, each at a multiple of its own size, and is padded to a multiple of
@@ -35,7 +35,7 @@ IIO, HWMON = 'bus/iio/devices', 'class/hwmon'
 
 
 def read_attribute(path: Path) -> str:
-    """Return the content of an attribute, stripped."""
+    """Return the content of an attribute, without surrounding white space."""
     try:
         return path.read_text(encoding='ascii', errors='replace').strip()
     except OSError as error:
@@ -54,7 +54,7 @@ def number_of(path: Path) -> float:
 def write_attribute(path: Path, value: object) -> None:
     """Set an attribute."""
     try:
-        # Without O_CREAT, so that a missing attribute is an error in an ordinary folder too.
+        # Without O_CREAT: a missing attribute must be an error in an ordinary folder (tests), too.
         handle = os.open(path, os.O_WRONLY | os.O_TRUNC)
         try:
             os.write(handle, f'{value}\n'.encode('ascii', 'replace'))
@@ -65,7 +65,7 @@ def write_attribute(path: Path, value: object) -> None:
 
 
 def reason_of(error: OSError) -> str:
-    """Return the reason of a file error, and what to do."""
+    """Return the reason for a file error, and the remedy."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return ('not permitted; give the user of this node the right by a udev rule or a group '
                 '(doc/deploy.md)')
@@ -75,7 +75,7 @@ def reason_of(error: OSError) -> str:
 
 
 def find_device(device: str, sysfs: Path) -> Path:
-    """Return the folder of a device by path, folder's name ('hwmon2') or driver ('ads1015')."""
+    """Return a device's folder: by path, folder name ('hwmon2') or driver name ('ads1015')."""
     if not device:
         raise InputError(f'no device given; available: {_names(sysfs)}')
     if '/' in device:
@@ -120,7 +120,7 @@ def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
 
 
 def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
-    """Return the file of an attribute: of the channel, of all voltages, of the device; or None."""
+    """Return the file of an attribute: the channel's, else the one for all; or None."""
     return next((folder / name for name in (f'{channel}_{what}', f'in_voltage_{what}', what)
                  if (folder / name).exists()), None)
 
@@ -131,7 +131,7 @@ def channel_number(folder: Path, channel: str, what: str, missing: float) -> flo
     return missing if path is None else number_of(path)
 
 
-# Polling rate where the driver does not state its own, Hz.
+# Polling rate if the driver does not state its own, Hz.
 USUAL_RATE = 10.0
 
 
@@ -208,7 +208,7 @@ class Scan:
         element = self._elements[name]
         stored = np.frombuffer(data, self._dtype)[name].astype(np.uint64)
         unused = np.uint64(64 - element.bits)
-        # Shift to the top and back: extends the sign, or masks the bits above.
+        # Shifting to the top and back extends the sign, or masks the bits above.
         top = (stored >> np.uint64(element.shift)) << unused
         if element.signed:
             return top.view(np.int64) >> np.int64(unused)
@@ -237,7 +237,7 @@ _CLOCKS: dict[str, int] = {
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Samples at an even spacing."""
+    """Evenly spaced samples."""
 
     stamp: float  # Time of the last sample, s since 1970
     volts: FloatArray  # Voltages, V; shape (n,)
@@ -247,7 +247,8 @@ class Block:
 class IioBuffer:
     """The buffer of one IIO device: its folder in sysfs, and its character device."""
 
-    # block: number of samples (0: 10 ms); rate, Hz, and trigger: set unless 0 or empty.
+    # block: samples per block (0: 10 ms of samples); rate, Hz, and trigger: 0 or empty keeps the
+    # device's own setting.
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
                  rate: float = 0.0, trigger: str = '') -> None:

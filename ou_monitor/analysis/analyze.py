@@ -1,8 +1,8 @@
 """
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-`SupplyMonitor` also processes the recording, as in flight, so that node and command agree on the
-same data; this needs no constant throttle.  The limits of the monitor apply.  The risk is for the
+`SupplyMonitor` processes the recording as it would in flight, so that command and node agree; for
+this part, throttle need not be constant, and the limits of the monitor apply.  The risk is for the
 state at the end of the recording, and NaN at throttles 0.1 or more above the highest flown.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
@@ -54,7 +54,7 @@ class Analysis:
     brownout_default: bool  # Whether the voltage of the risk is the default of the node
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise
-    craft: Craft  # Cells, and a comparison with known crafts
+    craft: Craft  # Cells, and a comparison with known craft
     alarms: tuple[Dips, ...]  # Dips below usual alarms per cell; empty if cells are unknown
 
 

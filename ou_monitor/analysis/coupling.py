@@ -8,23 +8,25 @@ supply and shows as a narrow line; a signal that *leads* the voltage because it 
 
 Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
 coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Segments
-are weighted by the noise of the signal, which grows with throttle, so that a few loud ones do not
-dominate.  Repeated readings of the ADC are dropped, because the steps between them come from the
-logger.
+are divided by the noise of the signal, which grows with throttle, so that a few loud ones do not
+dominate.  Repeated readings of the ADC are dropped: the steps between them come from the logger.
 
-Cubic splines, which do not alias, bring all series to the even grid of the fastest one (a series
-more than 8 times as fast as the slowest is averaged instead).  The usable band ends at a quarter
-of the slowest rate; above, the spline attenuates by more than 3 %.  Limits: aliases of the
-original sampling stay, and a stamp error of e seconds gives a phase error of 2 pi f e.
+Cubic splines bring all series to the even grid of the fastest one.  If that is more than 8 times
+as fast as the slowest, the grid has 4 times the slowest rate, and series more than 1.5 times as
+fast as the grid are averaged.  The usable band ends at a quarter of the slowest rate; above it,
+the spline attenuates by more than 3 %.  Limits: aliases of the original sampling remain, and a
+stamp error of e seconds gives a phase error of 2 pi f e.
 
 `measure_coherence` tests whether two series of any spectra are coherent.  Two tests must reject:
 
 - Each bin of each segment is divided by the rms of the signal over the bins around it, because a
   manoeuvre changes the shape of the gyro spectrum.  If the signal is then white Gaussian, the
   squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p), for
-  any voltage, with K segments and p causes regressed out (Halliday et al., 1995).
-- That does not whiten moving lines and bursts.  So the second test compares these statistics with
-  their values under random signs of blocks of neighbouring segments (Freedman and Lane, 1983).
+  any voltage, with K segments and p causes (throttle and its square) regressed out (Halliday et
+  al., 1995).
+- Moving lines and bursts are not whitened in this way.  So the second test compares the sum over
+  bins and the largest bin with their values under random signs of blocks of neighbouring segments
+  (Freedman and Lane, 1983).
 
 Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
 in both is detected although it is not coupling (`narrow`).
@@ -284,8 +286,8 @@ def _jackknife(frequency: FloatArray, v: ComplexArray, x: ComplexArray, density:
 
 # Minimum pause, in typical steps, that is a gap; gaps are not interpolated.
 GAP = 3.0
-# Maximum ratio of rates; above it the fastest series is averaged onto a slower grid, whose rate is
-# this multiple of the slowest rate.
+# Maximum ratio of the fastest to the slowest rate; above it, the grid has `_STEPS` times the
+# slowest rate, and faster series are averaged.
 _FASTEST = 8.0
 _STEPS = 4.0
 # Cubic splines need four points.

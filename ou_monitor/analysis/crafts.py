@@ -1,9 +1,9 @@
 """
-Compare sag, noise and resistance of a supply with known crafts.
+Compare sag, noise and resistance of a supply with known craft.
 
-Limits: a few crafts in each class, with one flight each; noise depends on where and how fast the
+Limits: a few craft in each class, with one flight each; noise depends on where and how fast the
 voltage was measured, so a slow or filtered sensor seems quiet.  "Usual" means within a factor of
-two of the median of the class, not that it is safe.
+two of the median of the class; it does not mean safe.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import NAN, plain_data, Recording
 from ou_monitor.text import counted, number
 
-# Throttle at which crafts are compared, and the half width about it that must have been flown.
+# Throttle at which craft are compared; half width of the range around it that must be flown.
 _AT, _NEAR = 0.5, 0.15
 # Maximum factor between a usual value and the median of its class.
 _USUAL = 2.0
@@ -30,13 +30,13 @@ _USUAL = 2.0
 # without damage (a lead-acid cell has 2.1 V), and lowest at the beginning of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
 # Lowest voltage of a cell at which a supply is guessed to be a pack, V: pilots are warned below it
-# (vbat_warning_cell_voltage of Betaflight).  Rails of 3.3, 5, 6, 9 and 10 V are no packs then.
+# (vbat_warning_cell_voltage of Betaflight).  Thus rails of 3.3, 5, 6, 9 and 10 V are not packs.
 _PACK = 3.5
-# Largest pack that is guessed: 100 V, the limit of usual ESCs of high voltage.
+# Largest pack that is guessed, cells: 100 V, the limit of common high-voltage ESCs.
 _MOST_GUESSED = 24
-# Voltage at rest that a guess of the cells prefers, V: between full (4.2) and half full (3.8).
+# Cell voltage at rest that a guess prefers, V: between full (4.2) and half full (3.8).
 _HALF = 4.0
-# Cells of usual LiFePO4 packs, and the range of the plateau of such a cell at rest, V.
+# Cells of common LiFePO4 packs, and the plateau of such a cell at rest, V.
 _IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
 # default of `design`).
@@ -67,11 +67,11 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
             'frc_ol_1': (3, NAN, NAN, 0.0275)}}
 # Maximum cells of the known quads.  More are not compared: 24 V packs of robots look like 7 cells.
 _MOST_CELLS = max(cells for cells, *_ in KNOWN[QUAD].values())
-# Cells of the class of robots, and formats that any vehicle may have recorded.
+# Cells of the class of robots, and formats that do not show the kind of vehicle.
 _ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')
 _UNITS = {'sag': 'mV per cell at 50 % throttle', 'noise': 'mV rms per cell at 50 % throttle',
           'resistance': 'mOhm per cell'}
-# Measure, whether high -> (likely reason, remedy).
+# (Measure, whether it is high) -> (likely reason, remedy).
 _REASONS = {
     ('sag', True): ('a small, aged or cold pack, thin or long leads, or a poor connector',
                     'feel whether a connector is warm after a flight, then try a fresh or larger '
@@ -91,7 +91,7 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Measure:
-    """One number of a supply, compared with known crafts."""
+    """One number of a supply, compared with known craft."""
 
     kind: str  # Class that it is compared with
     name: str  # sag, noise or resistance
@@ -104,7 +104,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Craft:
-    """Cells of a supply, its class, and a comparison with known crafts."""
+    """Cells of a supply, its class, and a comparison with known craft."""
 
     cells: int  # 0: unknown
     cells_from: str  # given, log, guessed or unknown
@@ -141,7 +141,7 @@ def cell_count(full: float) -> int:
 
 
 def fits(full: float, cells: int) -> bool:
-    """Return whether a pack of this number of cells may begin a flight with this voltage, V."""
+    """Return whether a pack of this number of cells can start a flight with this voltage, V."""
     return _BEGINS <= full / cells <= HIGHEST_CELL
 
 
@@ -158,7 +158,7 @@ def check_cells(full: float, cells: int) -> None:
 
 
 def doubtful_cells(full: float, cells: int) -> str:
-    """Return the doubt about cells that hardly fit the voltage at rest, V; empty without one."""
+    """Return a warning if this number of cells hardly fits the voltage at rest, V; else ''."""
     likely = cell_count(full)
     return '' if not (0 < likely < cells and full / cells < _BEGINS) else (
         f'{full:.4g} V at rest would be {full / cells:.3g} V per cell: the pack is damaged, or it '
@@ -166,7 +166,7 @@ def doubtful_cells(full: float, cells: int) -> str:
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:
-    """Return the limit of the pack, V, from volts (per cell, if cells are given), or None."""
+    """Return the limit of the pack, V, or None (voltage: per cell if cells are given)."""
     if not cells:
         return voltage
     if voltage is not None and voltage > _CELL_MOST:
@@ -200,7 +200,7 @@ def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
 
 
 def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
-    """Compare a supply with known crafts of its class, or of all possible classes."""
+    """Compare a supply with known craft of its class, or of all possible classes."""
     cells, source = cells_of(recording, given)
     kinds = [MICRO if cells == 1 else QUAD] if 0 < cells <= _MOST_CELLS else []
     if source == 'guessed' and cells == _ROBOT_CELLS and (
@@ -209,7 +209,8 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     if not kinds or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     seen = bool(flown_near(recording, _AT, _NEAR)[0])
-    # Noise that is high only while throttle changes is a load model error, not a bad capacitor.
+    # Noise that is high only while throttle changes comes from errors of the load model, not from
+    # a bad capacitor.
     calm = float(np.interp(_AT, facts.noise.throttle, facts.noise.steady_rms_v)) / cells
     # Values and standard errors; the error of the noise is negligible.
     values = {

@@ -2,15 +2,15 @@
 Compare load levels: the change of sigma, and whether alpha is constant.
 
 The paper assumes the same alpha at every load.  The test is chi^2 of ln(alpha) about the weighted
-mean, with standard errors at the common alpha: they are proportional to 1/sqrt(alpha T), so an
+mean, with standard errors for the common alpha: they are proportional to 1/sqrt(alpha T), so an
 alpha that is high by chance would otherwise weigh too much.  Levels that one OU in white noise
 does not describe (more than one relaxation, or lines with impulses) are withheld, because their
 standard errors ignore the misfit.  Limits: only levels with a usable fit count; weak spectral
 lines stay in the fit; not rejecting proves nothing, so the detectable ratio is reported too.
 
-The tests have the significance level `LEVEL`, like the printed intervals.  Each level is fitted by
-itself here; `discover` fits one model to a whole recording, and uses statistics of its innovations
-(`ou_monitor.criticism.score_statistics`) to decide whether they depend on throttle.
+The significance level is `LEVEL`, which matches the printed 95 % intervals.  Each level is fitted
+by itself here; `discover` fits one model to a whole recording, and tests whether its innovations
+depend on throttle (`ou_monitor.criticism.score_statistics`).
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class AlphaTest:
 
 
 def _factor(ratio: float) -> str:
-    """Return a ratio with three digits, or that it is beyond a factor of 100."""
+    """Return a ratio in words: three digits, 'more than 100' or 'less than 0.01'."""
     if ratio > 100.0:
         return 'more than 100'
     return 'less than 0.01' if ratio < 0.01 else f'{ratio:#.3g}'.rstrip('.')
@@ -148,7 +148,7 @@ def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
 class SigmaChange:
     """Ratio of the sigmas of two levels."""
 
-    # As fitted (NaN where it is not determined), and its 95 % interval.
+    # As fitted (NaN if not determined), and its 95 % interval.
     ratio: float
     ratio_low: float
     ratio_high: float
@@ -163,8 +163,8 @@ class SigmaChange:
 
 def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ()) -> SigmaChange:
     """Compare sigma of two usable levels; its error includes the scatter of all levels."""
-    # Scatter about a line of ln sigma over throttle, beyond the errors of the levels, has another
-    # cause than throttle, such as a load that throttle does not show.
+    # If ln sigma scatters about a line over throttle by more than the errors of the levels, the
+    # excess has another cause, such as a load that throttle does not show.
     every = [low, *others, high]
     scatter = 0.0
     if others:

@@ -7,7 +7,7 @@ spectral lines, is fitted by the model that all commands share (`ou_monitor.mode
 
 Limits: a relaxation slower than half of a segment, or than 2.5 s, counts as drift of the level.
 
-The types of process are from Table 1 of the paper, which assigns them by eye.  Here tests decide
+The process types are from Table 1 of the paper, which assigns them by eye.  Here tests decide
 (`ou_monitor.analysis.level_tests`), adjusted so that only one in a hundred recordings of
 stationary OU levels has any rejection.  The first rule that applies names the level:
 
@@ -60,7 +60,7 @@ _LINE_SHARE = 0.5
 
 
 class ProcessType(enum.Enum):
-    """Kind of process; the value is the word for the table."""
+    """Process type; the value is the word for the table."""
 
     CONSTANT = 'constant'
     QUASI_STATIONARY = 'quasi-stationary'
@@ -83,7 +83,7 @@ def detectable_kurtosis(n: int) -> float:
 
 @dataclass(frozen=True)
 class KindVerdict:
-    """Type of process of a level, and the reason."""
+    """Process type of a level, and the reason."""
 
     kind: ProcessType
     why: str  # Reason without numbers, by which levels are grouped
@@ -93,14 +93,14 @@ class KindVerdict:
 
     @property
     def sentence(self) -> str:
-        """Reason and numbers, one sentence."""
+        """Reason and numbers in one sentence."""
         why = self.why.rstrip('.')
         figures = f' ({self.figures})' if self.figures else ''
         return f'{why[0].upper()}{why[1:]}{figures}.'
 
 
 def classify(estimate: Estimate, shape: Shape, line_share: float = 0.0) -> KindVerdict:
-    """Name the kind of process and the reason."""
+    """Return the process type and the reason."""
     if estimate.status is Status.CONSTANT:
         return _plain(ProcessType.CONSTANT, 'the voltage never changes')
     if all(math.isnan(test.p_value) for test in shape.tests):
@@ -218,7 +218,8 @@ class LevelSpectrum:
 def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
                    estimate: Estimate) -> LevelSpectrum:
     """Return the PSD of a level (Welch, Hann), averaged over its segments."""
-    # Samples are taken as evenly spaced; uneven ones smear the PSD near the Nyquist frequency.
+    # Samples are treated as evenly spaced; if they are not, the PSD is smeared near the Nyquist
+    # frequency.
     longest = max((s.stop - s.start for s in segments), default=0)
     rate = segment_rate(recording, segments)
     if longest < _MIN_LENGTH or not rate > 0.0:
@@ -336,15 +337,15 @@ class LevelResult:
     deviation: FloatArray  # That deviation, V; shape (n,)
     ou: OuFacts  # Fitted relaxation (level, load and lines removed), or bounds on it
     estimate: Estimate  # The same fit in the form that the node reports
-    shape: Shape  # Tests of the type of process, adjusted over all levels
+    shape: Shape  # Tests of the process type, adjusted over all levels
     verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
     spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
-    lines: LineSearch = field(default_factory=LineSearch)  # Spectral lines
+    lines: LineSearch = field(default_factory=LineSearch)
     lines_kept: bool = False  # Whether the fit includes lines, because impulses may cause them
 
     @property
     def kind(self) -> ProcessType:
-        """Kind of process."""
+        """Process type."""
         return self.verdict.kind
 
     @property
@@ -372,14 +373,14 @@ class LevelResult:
         if self.n < _LEAST_BINNED or not self.vrms > 0.0:
             return np.zeros(0), np.zeros(0)
         z = self.deviation / self.vrms
-        # Limits for a plot.
+        # Bins of a width that suits a plot.
         width = min(max(bin_width(z), 0.05), 0.5)
         edges = np.arange(-6.0, 6.0 + width, width)
         return edges, np.histogram(z, edges)[0] / (self.n * np.diff(edges))
 
     @property
     def label(self) -> str:
-        """Name of the level for people."""
+        """Name of the level, as displayed."""
         return 'all' if math.isnan(self.throttle) else f'{100.0 * self.throttle:.3g} %'
 
 
@@ -438,7 +439,7 @@ def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) 
 
 
 def _known_parts(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
-    """Return the parts of a segment without gaps, in which the remainder is not NaN."""
+    """Return the parts of a segment in which the voltage is not NaN (it is near gaps)."""
     known = np.isfinite(voltage[segment.start:segment.stop])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start
     return [LevelSegment(a, b)

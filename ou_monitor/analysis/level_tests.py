@@ -1,5 +1,5 @@
 """
-Tests of the type of process at a load level, with calibrated p-values.
+Tests of the process type at a load level, with calibrated p-values.
 
 Each test works on the one-step innovations of the fitted model, which are independent and standard
 normal if the level is a stationary OU in white noise:
@@ -8,8 +8,8 @@ normal if the level is a stationary OU in white noise:
 mean_drift     means of blocks of innovations, F test that includes the errors of the fit
 variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 68, 1973),
                which is robust against heavy tails
-gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over
-               the standard deviation of their block
+gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations divided
+               by the standard deviation of their block
 impulses       the largest innovation (Sidak) or a positive excess kurtosis, each at
                half the significance level
 correlated     lags 1..5 of the deviation, with variances robust against changing
@@ -38,10 +38,10 @@ from ou_monitor.criticism.innovations import (
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
 from scipy import stats
 
-# Minimum samples of a test, and innovations of a block; maximum number of blocks.
+# Minimum samples for a test, and minimum innovations per block; maximum number of blocks.
 FEWEST = 50
 _BLOCKS = 16
-# Minimum relaxation times of a block in the test of the mean.
+# Minimum length of a block in the test of the mean, relaxation times.
 _MEAN_BLOCK = 5.0
 # The test of intensity leaves out innovations beyond this, standard deviations; otherwise a few
 # impulses would determine the variance of a block.  With heavy tails (Student's t with 5 degrees),
@@ -72,12 +72,12 @@ class TestResult:
     p_adjusted: float = NAN  # Holm-adjusted over all tests of all levels of the recording
     why_not: str = ''  # Why the test was not possible; otherwise empty
 
-    # Not a test class of pytest.
+    # pytest must not collect this class as a test.
     __test__ = False
 
     @property
     def rejects(self) -> bool:
-        """Whether it rejects at the level `FAMILY_WISE`, with an effect that matters."""
+        """Whether the test rejects at the level `FAMILY_WISE`, with an effect that matters."""
         return self.p_adjusted < FAMILY_WISE and self.effect >= LEAST[self.name]
 
 
@@ -87,7 +87,7 @@ class Shape:
 
     tests: tuple[TestResult, ...]  # In the order of `EFFECT`
     n: int  # Innovations
-    # Moments of the innovations over the standard deviation of their block; excess kurtosis.
+    # Skewness and excess kurtosis of innovations divided by the standard deviation of their block.
     skewness: float
     kurtosis: float
     impulses: int  # Innovations above the 99 % quantile of the largest of n normal ones
@@ -224,7 +224,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
 
 def _constant_gain(parts: Sequence[tuple[FloatArray, FloatArray]], alpha: float, var_inf: float,
                    noise_var: float) -> float:
-    """Return the innovation, per V, that a constant input settles to, 1/V."""
+    """Return the innovation to which a constant input of 1 V settles, 1/V."""
     t = max((t for t, _ in parts), key=len)
     step = float(np.median(np.diff(t)))
     steady: FloatArray = step * np.arange(float(max(64, t.size)))
@@ -236,7 +236,7 @@ def _block_count(n: int) -> int:
 
 
 def _per_block(z: FloatArray) -> FloatArray:
-    """Return innovations over the standard deviation of their block."""
+    """Return innovations, without their mean, divided by the standard deviation of their block."""
     pieces = np.array_split(z, _block_count(z.size))
     return join([(piece - piece.mean()) / max(float(piece.std()), 1e-300) for piece in pieces])
 
@@ -277,7 +277,7 @@ def _impulses(z: FloatArray, kurtosis: float, count: int) -> TestResult:
 
 
 def _portmanteau(name: str, parts: Sequence[FloatArray], lags: int) -> TestResult:
-    """Portmanteau of autocorrelations, their variances robust against changing intensity."""
+    """Portmanteau test of autocorrelations, with variances robust against changing intensity."""
     total = sum(float(d @ d) for d in parts)
     n = sum(d.size for d in parts)
     if not total > 0.0 or n <= 10 * lags:

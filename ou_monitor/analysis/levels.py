@@ -41,8 +41,8 @@ MIN_TIME = 0.25
 # paper.
 MIN_STAY = 0.5
 MAX_LEVELS = 20  # Maximum number of levels
-# A passage through a level: maximum duration, s; minimum difference between the means of its first
-# and last quarter, as a share of its range (0.75 for a ramp) and as a share of the half width.
+# A passage through a level: maximum duration, s; minimum difference between the means of the first
+# and last quarter, as a share of the passage's range (0.75 for a ramp) and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 
 # Bin width of the histogram of throttle.
@@ -62,7 +62,7 @@ class LevelSegment:
 
 @dataclass(frozen=True)
 class LoadLevel:
-    """One throttle and where in the recording it was held."""
+    """A throttle, and the segments of the recording in which it was held."""
 
     throttle: float  # Throttle of the level, 0..1; NaN if it is the whole recording
     segments: tuple[LevelSegment, ...]  # Segments at this throttle, without settling
@@ -158,7 +158,7 @@ def _checked(given: tuple[float, ...]) -> list[float]:
 
 
 def _gaps(t: FloatArray) -> BoolArray:
-    """Return where a pause lies before the sample; shape (n,)."""
+    """Return which samples follow a pause; shape (n,)."""
     steps = np.diff(t)
     if not steps.size:
         return np.zeros(t.size, dtype=np.bool_)
@@ -260,7 +260,7 @@ def _split_at_pauses(run: LevelSegment, broken: BoolArray) -> list[LevelSegment]
 
 
 def _passage(t: FloatArray, throttle: FloatArray, run: LevelSegment, width: float) -> bool:
-    """Return whether throttle only passes through."""
+    """Return whether throttle only passes through the level."""
     if t[run.stop - 1] - t[run.start] >= _PASSAGE:
         return False
     inside = throttle[run.start:run.stop]

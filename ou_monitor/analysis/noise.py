@@ -35,7 +35,7 @@ _STEADY, _STEADY_TIME = 0.02, 0.2
 _WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
-# Minimum time of these readings, s, or share of the recording, whichever is shorter.
+# Minimum time covered by these readings, s, or share of the recording, whichever is shorter.
 _IN_TIME, _IN_SHARE = 0.5, 0.02
 
 
@@ -77,7 +77,7 @@ def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
 
 
 def is_below(v: FloatArray, limit: float) -> npt.NDArray[np.bool_]:
-    """Return which readings are below a limit by more than a float32 in a message rounds."""
+    """Return which readings are below a limit by more than the rounding error of a float32."""
     return v < limit - 2.0 ** -23 * abs(limit)
 
 
@@ -130,7 +130,7 @@ def remainder(recording: Recording) -> Remainder:
 
 
 def without_wild(recording: Recording, left: Remainder) -> tuple[Recording, Remainder]:
-    """Return a recording without outliers from level and load, and its remainder."""
+    """Return a recording without outliers of its remainder, and the new remainder."""
     known = np.flatnonzero(np.isfinite(left.voltage))
     wild = known[find_bad(left.voltage[known], int(_WILD * known.size))]
     if not wild.size:

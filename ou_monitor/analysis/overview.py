@@ -41,10 +41,10 @@ class LoudestLine:
     rms: float  # V
     share: float  # Share of the variance of its level, 0..1
     level: str  # Throttle of that level, in words
-    # Number of lines of that level, and their total share.
+    # Number of lines of that level, and their total share of its variance.
     lines: int
     all_share: float
-    fundamental: float  # Frequency of which most are multiples, Hz; NaN if there is none
+    fundamental: float  # Frequency of which most lines are multiples, Hz; NaN if there is none
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class Overview:
     # Lowest and highest index of THROTTLES near which there are enough readings.
     flown: tuple[int, int]
     drawn: float = NAN  # Largest current, A, after a median of three readings; NaN without one
-    # Noise at the highest over noise at the lowest throttle flown, from a fit to all throttles.
+    # Ratio of the noise at the highest throttle flown to the noise at the lowest, from a fit.
     growth: float = 1.0
     step: float = 0.0  # Median time between readings, s
-    line: LoudestLine | None = None  # Strongest spectral line
+    line: LoudestLine | None = None
     cells: int = 0  # Number of cells in series, for the limit per cell; 0: not given
     end: MonitorReport | None = None  # Report of the node at the end; None without a limit
     # Fit of the whole recording, if that is one stationary level, and if the fit is more precise
@@ -105,7 +105,7 @@ def overview(recording: Recording, limit: float | None = None,
 
 
 def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:
-    """Return the noise at the highest over the lowest throttle, by a weighted fit (rms in V)."""
+    """Return the ratio of noise at the highest and lowest throttle, by a fit (rms in V)."""
     if len(near) < 2 or not min(rms[k] for k in near) > 0.0:
         return 1.0
     u = np.array(THROTTLES)[near]
@@ -144,7 +144,7 @@ def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
 
 
 def answers(found: Overview) -> list[str]:
-    """Return the answer, a sentence each: the lowest voltage, then sag and lines."""
+    """Return the answer as a list of sentences: the lowest voltage, then sag and lines."""
     parts, least = [], found.facts.lowest
     if math.isfinite(found.limit) and math.isfinite(least.voltage_v):
         lowest = f'the lowest was {number(least.voltage_v, 4)} V at {number(least.time_s)} s'

@@ -1,8 +1,9 @@
 """
 Cautions about the quality of a recording, worst first.
 
-They come from the flags of each level, samples that the reader dropped or repaired, samples and
-stamps themselves, and the effects of lines and of a second relaxation on the fit of a level.
+They come from the flags of each level, the samples that the reader dropped or repaired, the
+samples and stamps themselves, and the effects of lines and of a second relaxation on the fit of a
+level.
 
 Limits: a list without warnings does not prove that a recording is free of defects.
 """
@@ -25,10 +26,10 @@ from ou_monitor.timeline import GAP_STEPS, scatter_words
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
-# Statuses that are not defects: the rate or length of the recording allows no more.
+# Statuses that are not defects: the rate or length of the recording does not allow an estimate.
 _LIMITS = frozenset({Status.TOO_FEW_SAMPLES, Status.TOO_SHORT, Status.UNBOUND, Status.BURIED,
                      Status.NO_RELAXATION})
-# Maximum scatter of the steps of an even clock: rms about the median, in medians.
+# Maximum scatter of the steps of an even clock: rms about the median, as a share of the median.
 _UNEVEN = 0.05
 # Step, s, above which a wrong time unit is suspected (battery messages of autopilots come more
 # often); a lower one for recordings longer than _LONG_FLIGHT, s.
@@ -78,8 +79,8 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
 def _fit_doubts(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items = []
     if e.status in _LIMITS and known:
-        items.append(('LEVEL_ALONE', Severity.INFO, 'The relaxation is visible only where the '
-                      'load is removed, not at this level alone.'))
+        items.append(('LEVEL_ALONE', Severity.INFO, 'The relaxation is visible in the noise at '
+                      'all throttles together, not at this level alone.'))
     elif e.status in _LIMITS:
         items.append((e.status.name, Severity.INFO, e.status.value))
     elif e.status is not Status.OK:

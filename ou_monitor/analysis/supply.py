@@ -7,8 +7,8 @@ and Var_inf come from regressions of the voltage on level, throttle and current
 shortest window at the end of the recording in which alpha is known within a factor of 1.5, else
 from the longest.
 
-The limits of that fit and of the node's filter apply.  The filter takes most of the time: 1.6 CPU
-s for 130 s at 200 Hz; with a limit, the budget makes it 4 s.
+The limits of that fit and of the node's filter apply.  The filter takes most of the time: 1.6 s of
+CPU time for 130 s at 200 Hz; with a limit, the budget raises this to 4 s.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _POINTS, _STEP, _MOST = 300, 0.5, 1200
 _SLICE = 100_000
 # Maximum number of dips that are listed.
 _DEEPEST = 10
-# Usual alarms of pilots, V per cell, about Betaflight's vbat_warning_cell_voltage of 3.5.
+# Common voltage alarms, V per cell, around Betaflight's vbat_warning_cell_voltage of 3.5.
 ALARMS = (3.7, 3.6, 3.5, 3.4, 3.3)
 
 
@@ -59,7 +59,7 @@ class Lowest:
 class Dip:
     """One dip below a limit."""
 
-    begin_s: float  # time from the first reading to its begin, s
+    begin_s: float  # time from the first reading to its start, s
     lowest_v: float  # V
     seconds: float  # time below, s
     throttle: float  # at its lowest reading, 0..1
@@ -126,7 +126,7 @@ class SupplyFacts:
     resistance : Resistance
         Resistance, from the measured current.
     ou : OuFacts
-        Relaxation, or bounds of it.
+        Relaxation, or bounds on it.
     budget : Budget or None
         Throttle budget; None without a limit.
 
@@ -236,7 +236,7 @@ def node_for(recording: Recording, settings: MonitorSettings,
 
 def fed(recording: Recording, window: float, push: Callable[[slice], None],
         ) -> Iterator[tuple[float, bool]]:
-    """Push a recording in parts; yield the time, s, and whether it is one of `_POINTS` shown."""
+    """Push a recording in parts; yield each end, s, and whether the report there is shown."""
     t, duration, done = recording.t, recording.duration, 0
     step = max(0.25 * window, duration / _POINTS)
     each = max(1, min(math.ceil(step / _STEP), _MOST // _POINTS))
@@ -274,7 +274,7 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, rise: Float
     begins = dip_begins(v, limit, rise)
     if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)
-    # Each reading stands for the time to the next one, without gaps.
+    # Each reading stands for the time to the next one, but for 10 usual steps at most.
     spacing = np.diff(t)
     usual = float(np.median(spacing)) if spacing.size else 0.0
     held = np.where(is_below(v, limit), np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
