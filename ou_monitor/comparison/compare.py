@@ -32,8 +32,8 @@ _POINTS = 2000
 # Minimum probability of the other kind of level (constant or falling) to be reported.
 _UNSURE = 0.05
 # Minimum time at the beginning over which a model from a file is aligned with the recording, s.
-# It is doubled until the deviation of a simulation's mean over it is below this share of the
-# deviation of single samples, that is until it holds about ten independent pieces.
+# This time is doubled until the mean over it scatters between simulations by less than the given
+# share of the scatter of single samples, so that it holds about ten independent pieces.
 _ALIGNED, _STEADY = 2.0, 0.3
 
 
@@ -184,7 +184,7 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
 
 def _checked_load(model: SupplyModel, samples: Readings, name: str, notes: list[str]
                   ) -> Readings:
-    """Return the readings with the load of a model from a file, delays corrected."""
+    """Return the readings with late current corrected; raise InputError without the load."""
     needs = model.needs_throttle
     if model.full_current:
         if needs and samples.current is None:

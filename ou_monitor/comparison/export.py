@@ -53,12 +53,12 @@ class Export:
 
 @dataclass(frozen=True)
 class _Numbers:
-    """Values of the parameters that the targets have."""
+    """Numbers from which the parameters of the targets are computed."""
 
     cells: int
     full: float  # Initial level, V
     empty: float  # Level that counts as empty, V
-    drain: float  # Time between these levels under the usual load, s; inf: it does not fall
+    drain: float  # Time between these levels under the usual load, s; inf: no discharge
     charge: float  # Charge drawn between these levels, 0..1 of the pack
     share: float  # Usual load, as a share of the load at full throttle
     sag: float  # Sag at full throttle, V

@@ -6,7 +6,7 @@ residual is an OU in white noise; the size of both follows the load and its chan
 
 Limits: errors come from four held-out parts, so a lasting change after the fitted part is not
 covered; one OU describes all correlated noise, and its size and the size of the white noise follow
-the load in the same way; readings are taken as evenly spaced.
+the load in the same way; readings are treated as evenly spaced.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Readings:
     # Stamps, s, and readings, V; shape (n,).
     t: FloatArray
     voltage: FloatArray
-    # 0..1, and A; None if not recorded; shape (n,).
+    # Throttle, 0..1, and current, A; None if not recorded; shape (n,).
     throttle: FloatArray | None
     current: FloatArray | None = None
 
@@ -241,7 +241,7 @@ def _simulated_load(fit: LoadFit | None, samples: Readings) -> FloatArray | None
 class FiledModel:
     """A model from a file, simulated at the readings only, without repeats."""
 
-    model: SupplyModel  # As in the file
+    model: SupplyModel
 
     @property
     def names(self) -> list[str]:
@@ -298,7 +298,7 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load, its fit, and for each part a fit to the others, with its errors in that part, V."""
+    """A load and its fit; for each part, a fit to the other parts and its errors there, V."""
 
     fit: LoadFit
     current: FloatArray | None

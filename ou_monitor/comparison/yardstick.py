@@ -97,7 +97,7 @@ class Traces:
     simulated_distribution: FloatArray
 
 
-# Count of numbers outside their 95 % bands that only 2 % of good simulations reach (of 12).
+# Number of rows (of 12) outside their 95 % bands that only 2 % of good simulations reach.
 _TOO_MANY = 3
 
 
@@ -105,7 +105,7 @@ _TOO_MANY = 3
 class Agreement:
     """A recording, compared with its simulations."""
 
-    recording: str  # Name
+    recording: str
     # Time ranges, s after the first sample; (0, 0) if nothing was fitted.
     fitted: tuple[float, float]
     simulated: tuple[float, float]
@@ -118,17 +118,17 @@ class Agreement:
     # Lowest and mean voltage, V.
     lowest: Band
     mean: Band
-    levels: tuple[float, ...]  # Levels, V
+    levels: tuple[float, ...]  # V
     dips: tuple[Band, ...]  # Dips below each level per minute
     spectrum: tuple[SpectrumBand, ...]  # By band of frequency
     line: SpectrumBand | None  # About the strongest spectral line of the recording, if any
     # Deepest fall of the mean response to rises of throttle, and its value 1 s after, V.
     fall: Band | None
     recovery: Band | None
-    rises: int  # Rises of throttle
+    rises: int
     # Largest difference (KS) from the joint distribution of all simulations.
     apart: Band
-    seeds: int  # Simulations
+    seeds: int
     p_value: float  # Share of simulations and recording with at least the recording's score
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
@@ -187,7 +187,7 @@ def _ratio(rms: Band) -> float:
     return rms.median / rms.measured if rms.measured > 0.0 else float('nan')
 
 
-# Quantiles of the measured voltage that are the two low levels.
+# Quantiles of the measured voltage that give the two low levels.
 LOW_SHARES = (0.01, 0.05)
 # Bands of the spectrum, and maximum length of a Welch segment, s.
 _BANDS, _SEGMENT = 5, 20.0
@@ -268,7 +268,7 @@ class Yardstick:
 
 
 def between_codes(level: float, lsb: float, code: float = 0.0) -> float:
-    """Return the midpoint above the code nearest below a level, V (code: any of them)."""
+    """Return the midpoint between the two codes around a level, V (code: any code)."""
     return code + (np.floor((level - code) / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
 
 

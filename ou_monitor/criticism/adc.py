@@ -38,7 +38,7 @@ _LOADS, _STILL = 8, 0.01
 
 
 def find_step(voltage: FloatArray) -> float:
-    """Return the step of the grid on which the values lie (voltage in V)."""
+    """Return the step of the grid on which the values lie, V; 0 if none is found."""
     v = voltage[:EXAMINED]
     if v.size > 16:
         # The extremes may be clipped off the grid.
@@ -65,8 +65,8 @@ def usual_change(voltage: FloatArray) -> float:
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
     size = np.sort(np.abs(np.diff(voltage[:EXAMINED])))
     size = size[size > rounding]
-    # Equal sizes, and as many as that within ten times this distance: the changes of a smooth line
-    # crowd too, but evenly.
+    # `same` counts sizes that are equal within rounding; it must be most of `near`, the sizes
+    # within ten times that distance: changes of a smooth line are close too, but evenly spread.
     same, near = (np.searchsorted(size, size + by * rounding, 'right')
                   - np.searchsorted(size, size - by * rounding) for by in (0.5, 5.0))
     count = np.where(2 * same > near, same, 0)
@@ -108,7 +108,7 @@ def innovation_std(v: FloatArray) -> float:
     """Return the standard deviation of the error of an AR(1) prediction, V, without outliers."""
     a, b = v[:-1] - v[:-1].mean(), v[1:] - v[1:].mean()
     e = b - float(a @ b) / max(float(a @ a), 1e-300) * a
-    # Limit the errors of events and load steps.
+    # Clip the errors at events and load steps.
     middle = float(np.quantile(np.abs(e), 0.95))
     return float(np.minimum(np.abs(e), middle).std()) if middle == 0.0 else float(
         np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
@@ -312,8 +312,8 @@ def _in_long_runs(v: FloatArray) -> npt.NDArray[np.bool_]:
 def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     """Return the share of ties between neighbours that is expected without holds."""
     # If a share h of the samples is held, values k samples apart are equal with probability h^k;
-    # other ties are chance.  Chance ties between neighbours are likelier by the ratio of the rms
-    # differences at lags k and 1: sqrt(k) in a diffusion, less in white noise.
+    # other ties are chance.  A chance tie is likelier between neighbours than k samples apart, by
+    # the ratio of the rms differences: sqrt(k) in a diffusion, less in white noise.
     near = float(np.mean((v[1:] - v[:-1]) ** 2))
     shares = []
     for k in _APART:

@@ -1,9 +1,9 @@
 """
 Fit a whole model: its Gaussian part, then the laws of its innovations in turn.
 
-A law is a term of the distribution of the innovations.  It maps normal scores to new ones and
-returns the ratio of densities, so that laws can be chained.  Events that a law finds go back into
-the Gaussian part as extra variance, and both are fitted again.
+A law is a term that describes the distribution of the innovations.  It maps normal scores to new
+ones and returns the ratio of densities, so that laws can be chained.  Events that a law finds
+enter the Gaussian part as extra variance, and both are fitted again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.records import FloatArray
 
-# Maximum rounds between laws and the Gaussian part.
+# Maximum rounds in which laws and Gaussian part are refitted.
 _ROUNDS = 3
 # Limits of a factor on the noise; convergence tolerance of its mean change, in logarithms.
 _POWERS = 1e-3, 1e3
@@ -37,13 +37,13 @@ class Composite:
 
     terms: tuple[Term, ...]  # All, laws included, with parameters
     se: tuple[dict[str, float], ...]  # Standard errors, one dict per term
-    gaussian: GaussianFit  # Its Gaussian part
+    gaussian: GaussianFit
     z: FloatArray  # Normal scores of the one-step predictions; shape (n,)
     density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
-    free: int  # Number of free parameters
+    free: int
     search: float  # Penalty for searched alternatives, nats
     events: Events | None = None  # Events from the laws, used in the Gaussian part
-    offset: FloatArray | None = None  # Offset from the laws, used there too, V; shape (n,)
+    offset: FloatArray | None = None  # Offset from the laws, used likewise, V; shape (n,)
     cost: float = 0.0  # Processor time of the fits, s, estimated from filters and laws
 
     def score(self, samples: Samples) -> float:

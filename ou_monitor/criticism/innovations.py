@@ -1,24 +1,24 @@
 """
 One-step innovations of an OU in white noise, and a test of their spectrum for another pole.
 
-`analyze` applies it to the residual of a load level, `discover` to a whole recording.
+`analyze` applies the test to the residual of a load level, `discover` to a whole recording.
 
 Under the right model the innovations are independent and standard normal, and the ordinates of
 their periodogram are independent and exponential.
 
-Second OU, slower or faster by a known factor: it raises the ordinates in a known pattern.  The
-part of the pattern that the fit absorbs (alpha, sigma, white noise) is projected out, and the rest
-is compared with the ordinates.  For small deviations this score test is the most powerful one;
+A second OU, slower or faster by a known factor, raises the ordinates in a known pattern.  The part
+of the pattern that the fit absorbs (alpha, sigma, white noise) is projected out, and the rest is
+compared with the ordinates.  For small deviations this score test is the most powerful one;
 correlations at single lags would miss a second OU ten times slower, which is correlated over
 hundreds of samples.
 
-AC-coupled instrument, a high-pass: the ordinates below its corner are too small.  Their sum is
-tested by the gamma distribution, which is exact for few ordinates too (the lower tail of the score
-is not).  A detection requires that more than half of their power is missing, because the
-regression of the mean also removes some.
+An AC-coupled instrument is a high-pass: the ordinates below its corner are too small.  Their sum
+is tested by the gamma distribution, which is exact for few ordinates too (the lower tail of the
+score is not).  A detection requires that more than half of the power is missing there, because
+the regression of the mean also removes some.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
-absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
+absorbed by the fit; linear drifts are removed; samples are treated as evenly spaced.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from scipy.signal import periodogram
 # Probability that any test rejects a right model: in `analyze` over all levels of a recording, in
 # `discover` over the whole recording.  One in a hundred, as for lines.
 FAMILY_WISE = 0.01
-# Minimum variance of a second relaxation that matters, over Var_inf.
+# Minimum variance of a second relaxation that matters, as a share of Var_inf.
 LEAST_SHARE = 0.1
 # Tested rates of the other pole, relative to the rate of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
@@ -56,7 +56,7 @@ class OtherPole:
     """Tests of the spectrum of innovations for another pole; NaN with too few samples."""
 
     second_p: float = NAN  # p-value of a second relaxation
-    second_share: float = NAN  # Its variance, over Var_inf
+    second_share: float = NAN  # Its variance, as a share of Var_inf
     coupling_p: float = NAN  # p-value of an AC-coupled instrument
 
 
@@ -102,7 +102,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
     # The ordinates at 0 and at half the rate have a different distribution.
     frequency = join([f[1:-1] if f[-1] == 0.5 * rate else f[1:] for f, _ in both])
     power = join([p[1:-1] if f[-1] == 0.5 * rate else p[1:] for f, p in both])
-    # The removal of a trend takes part of the first ordinate, as a high-pass would.
+    # Removing the trend lowers the first ordinate, as a high-pass would.
     first = np.isin(frequency, [f[1] for f, _ in both])[frequency > above]
     frequency, power = frequency[frequency > above], power[frequency > above]
     if frequency.size < _FEWEST:

@@ -143,7 +143,7 @@ def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) 
 
 
 def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
-    """Return throttle if it moves; otherwise None, and note the causes that cannot be tested."""
+    """Return throttle if it moves, else None with a note on the causes that cannot be tested."""
     if u is not None and float(u.max() - u.min()) >= MOVES:
         return u
     names = [name for name, kind in catalogue().items() if kind.NEEDS_THROTTLE]

@@ -34,10 +34,11 @@ _ODD, _ODD_SHARE = 3, 1e-3
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
-# Largest throttle, with trim, and tolerance of the range 0..1; readers convert or refuse units.
+# Largest throttle, with trim, and tolerance of the range 0..1; the readers of recordings have
+# converted or refused other units.
 _MOST, _EDGE = 1.5, 0.05
-# Maximum gap in a current, s; quantile of its size taken as full load; lags of the mean response
-# to a load, s.
+# Maximum gap in a current, s; quantile of its absolute value that counts as full load; lags of the
+# mean response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
 # Probability that an unrelated current is taken as the load if there is no throttle.
 _CHANCE = 0.02
@@ -95,8 +96,8 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
             notes: list[str]) -> tuple[FloatArray | None, float]:
     """Return the load, and the current at which it is 1, A; NaN if the load is throttle."""
-    # t in s, v in V.  The current is the load unless throttle predicts the voltage better.  It is
-    # divided by its 99 % quantile.
+    # t in s, v in V.  The current, divided by its 99 % quantile, is the load unless throttle
+    # predicts the voltage clearly better.
     moved: list[str] = []
     if u is not None:
         u, _ = on_time(t, v, u, 'throttle', moved)
@@ -132,8 +133,8 @@ def _part(v: FloatArray) -> slice:
 def on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str]
             ) -> tuple[FloatArray, float]:
     """Return a load with late stamps corrected, and its sign; note the correction."""
-    # A voltage cannot precede its load, so the stamps of such a load are late; a voltage that
-    # follows late is the cause `load_transient`.
+    # If the voltage seems to precede its load, the stamps of the load are late.  If the voltage
+    # lags behind its load, the cause is `load_transient`.
     some = _part(v)
     late, sign = timing(t[some], v[some], load[some])
     if not late > 0.0 or (name == 'throttle' and sign < 0.0):
@@ -151,8 +152,8 @@ def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
     spread = columns.std(axis=1)
     trend = np.stack([np.ones(t.size), (t - t.mean()) / max(float(np.ptp(t)), 1e-300)])
     both = np.concatenate((trend, columns[spread > 0.0] / spread[spread > 0.0, None]))
-    # The noise is an AR(1) whose coefficient is that of its slowest part, so that a wandering
-    # level does not pass for a response.
+    # The noise is taken as an AR(1) with the coefficient of its slowest part, so that a wandering
+    # level is not mistaken for a response.
     without, left = (_rest(v, x, 0.0) for x in (trend, both))
     slow = _slowest(left)
     alone = min(_squares(v, trend, phi) for phi in (slow, _slowest(without)))
@@ -161,7 +162,7 @@ def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
 
 
 def _rest(v: FloatArray, columns: FloatArray, phi: float) -> FloatArray:
-    """Return what a regression leaves, after both sides are whitened by an AR(1)."""
+    """Return the residual of a regression whose two sides are whitened by an AR(1)."""
     x, y = columns[:, 1:] - phi * columns[:, :-1], v[1:] - phi * v[:-1]
     beta = np.linalg.lstsq(x @ x.T, x @ y, rcond=1e-9)[0]
     return np.asarray(y - beta @ x)
@@ -277,7 +278,7 @@ def two_levels(v: FloatArray) -> str:
         return ''
     apart, steps = float(high[k] - low[k]), np.diff(ordered)
     within = math.sqrt(max(0.0, float(ordered.var() - between[k] / ordered.size ** 2)))
-    # Without transitions between the levels.
+    # Leave out transitions between the levels.
     there = v[np.abs(v - 0.5 * (low[k] + high[k])) > 0.25 * apart] > ordered[k]
     switches = int(np.count_nonzero(np.diff(there)))
     least = max(_APART * within, _STEPS * float(steps[steps > 0.0].min()))

@@ -38,8 +38,8 @@ _EXAMINED = 1_000_000
 # Samples that share a noise scale; probability that noise alone makes any change an event; margin
 # for the error of the scale.
 _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
-# Minimum change of throttle of a load step, and the time after it in which a change of voltage is
-# attributed to the load, s.
+# Minimum change of throttle that counts as a load step, and the time after it in which a change of
+# voltage is attributed to the load, s.
 _STEPS, _SOON = 0.01, 0.02
 # Maximum number of events around which more samples are kept; if there are more events, the
 # samples used contain enough of them.
@@ -204,7 +204,7 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
 
 def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone]:
     """Find steady lines in all samples above the Nyquist frequency of the samples used."""
-    # In the samples used they would be aliased, and mostly hidden by noise.
+    # In the samples used, such lines would be aliased, and mostly hidden by noise.
     k = which.step or 1
     part = slice(which.start, min(which.stop, voltage.size))
     t, v = t[part], voltage[part]
