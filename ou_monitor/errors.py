@@ -44,13 +44,13 @@ class InputError(Exception):
 
 
 def refusal(error: OSError) -> str:
-    """Return the reason of an error of the operating system, in one line."""
+    """Return the reason for an error of the operating system, in one line."""
     why = ' '.join((error.strerror or str(error)).split())
     return printable(why if error.filename is None else f"cannot use '{error.filename}': {why}")
 
 
 def how_to_install(extra: str) -> str:
-    """Return how to install an extra; the package is not on PyPI, so from its source."""
+    """Return how to install an extra: from the source, because the package is not on PyPI."""
     return f"run pip install '.[{extra}]' in the folder of its source"
 
 

@@ -41,14 +41,14 @@ RELAXES = 20.0
 CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
-# Total filter time after which kinds whose fit takes seconds are no longer tried, s; twice that
-# for BROAD ones, because a spectrum shows beforehand whether they gain, and because without them
-# the slow residual of a response to throttle halved alpha.
+# Total filter time after which kinds whose fit takes seconds are no longer tried, s.  For BROAD
+# kinds it is doubled: a spectrum shows beforehand whether they gain, and when they were left out,
+# the slow residual of a response to throttle halved the fitted alpha.
 MOST_COST = 10.0
-# Limit of a statistic: by chance, any of 70 exceeds it in 1 of 2300 recordings (3 of 8700 drawn).
+# Limit of a statistic: by theory, any of 70 exceeds it by chance in 1 of 2300 recordings; in
+# simulations, it was 3 of 8700.
 FAILS = 4.8
-# Maximum share of its initial value that a statistic may keep, because the form of a cause is not
-# exact.
+# Maximum share of its initial value that a statistic may keep: the form of a cause is never exact.
 OWN_SHARE = 0.07
 # In a model with measured causes: maximum share of a latent cause's largest sign that may remain.
 # In 70 independently simulated recordings (b052f3b), right causes with a sign still above FAILS
@@ -99,7 +99,7 @@ def affordable(kind: Kind, cost: float) -> bool:
 # -- acceptance of trials
 
 def least_evidence(kind: Kind, largest: float, again: int = 0) -> float:
-    """Return the minimum evidence of a response of the mean, nats (largest: of all together)."""
+    """Return the minimum evidence of a response, nats (largest: evidence of all together)."""
     # again: number of samples if the model already has a term of this kind, because another one
     # may only correct its form; otherwise 0.
     least = min(FORM * largest, VISIBLE * again)
@@ -117,7 +117,7 @@ def is_latent(kind: Kind) -> bool:
 
 
 def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:
-    """Return whether the total gain of a recording's parts exceeds its standard error, nats."""
+    """Return whether the total gain of parts, nats, exceeds `errors` times its standard error."""
     # If only one part gains, the standard error of the sum equals that gain; for an effect that
     # gains g nats evenly, it is sqrt(2 g).
     parts = np.asarray(gains, dtype=np.float64)

@@ -43,12 +43,12 @@ class Criticism:
 
     @property
     def was_off(self) -> bool:
-        """Whether the plain model leaves it outside the band."""
+        """Whether the statistic lies outside the band under the plain model."""
         return not self.low <= self.before <= self.high
 
     @property
     def is_off(self) -> bool:
-        """Whether the extended model leaves it outside the band."""
+        """Whether the statistic lies outside the band under the extended model."""
         return not self.low <= self.after <= self.high
 
 
@@ -56,14 +56,14 @@ class Criticism:
 class Cause:
     """A cause that was named."""
 
-    term: Term  # With its parameters
+    term: Term
     se: Mapping[str, Any]  # Standard errors, in the units of the parameters; NaN where not known
-    # Loss of held-out score without it, nats per sample.
+    # Loss of held-out score without the cause, nats per sample.
     gain: float
     gain_se: float
     p_value: float  # See `gain.cause_gain`; 0 for exact findings
     alternatives: tuple[str, ...]  # Causes that this recording cannot separate from it
-    explanation: str  # In words
+    explanation: str
     exact: bool  # Found without a model
 
     @property
@@ -137,11 +137,11 @@ class LoadFall:
 class Finding:
     """Result of `discover`."""
 
-    recording: str  # Name
+    recording: str
     n: int  # Samples of the recording
     duration: float  # s
     verdict: Verdict
-    words: tuple[str, ...] = ()  # The verdict, a sentence each
+    words: tuple[str, ...] = ()  # The verdict, in sentences
     baseline: OU | None = None  # The plain model, fitted to everything
     # Mean log predictive density of held-out blocks, nats per sample.
     baseline_score: float = NAN

@@ -53,16 +53,16 @@ class Trial:
     """A candidate, fitted together with the accepted causes."""
 
     name: str  # Name of the cause
-    composite: Composite  # The model with it
+    composite: Composite
     evidence: float  # nats
     beside: str = ''  # Name of a cause that it needs and that is added with it; otherwise empty
 
 
 @dataclass(eq=False)
 class Fitter:
-    """Fits of models to one recording, and their processor time."""
+    """Fit models to one recording, and count the processor time."""
 
-    samples: Samples  # The recording
+    samples: Samples
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
     # For each law, the scores to which it was last fitted, and the result.
     law_fits: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
@@ -225,7 +225,7 @@ class Fitter:
     def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0,
                    starts: Sequence[Term] | None = None) -> Composite | None:
         """Return the best fit with one more term of a kind (starts: its candidates by default)."""
-        # least: nats that its spectrum must gain.
+        # least: minimum gain of a BROAD kind in the spectrum, nats.
         if kind.ROLE is Role.LAW and not starts:
             found = self.fit([*composite.terms, kind], composite, rough=True)
             return found if found is not None and found.terms[-1].holds(view) else None
@@ -297,8 +297,8 @@ def _added_term(composite: Composite) -> Term:
 
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
-    """Sort starts by what they gain in the normal scores; drop lines far below the penalty."""
-    # Other kinds are kept, because the `ou` absorbs part of a slow one, which then gains little.
+    """Sort starts by their gain in the normal scores; drop lines that gain too little."""
+    # Other kinds are kept: the `ou` absorbs part of a slow effect, which then gains little here.
     s = samples.segment(1.0, 0.0)
     scale = np.sqrt(view.variance)
     price = 0.5 * math.log(samples.train.stop)

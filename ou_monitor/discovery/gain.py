@@ -157,14 +157,15 @@ def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
 FOLDS = 6
 # Maximum change of a parameter, in its logarithm, as in a fit.
 _FAR = 1.5
-# Maximum mean loss from errors of the parameters, nats per sample; at the limit they are as large
-# as the noise.
+# Maximum mean loss from errors of the parameters, nats per sample; at the limit, their effect is
+# as large as the noise.
 _UNKNOWN = 0.5
 # Maximum number of times that a step is halved; then only the mean is fitted again.
 _HALVINGS = 5
-# Loss of likelihood of the other blocks, nats, up to which a step counts as right.
+# Maximum loss of likelihood of the other blocks for a step to be accepted, nats.
 _ROUGH = 0.1
-# Margin by which throttle may exceed the range of the other blocks: share of that range, minimum.
+# Margin by which throttle may exceed the range of the other blocks: share of that range, and its
+# minimum.
 _BEYOND, _STILL = 0.05, 0.01
 # After throttle that no other block contains, samples are not scored for this time, s; most lags
 # of recorded flights are shorter.
@@ -230,8 +231,8 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
 def _refitted(data: Samples, terms: Sequence[Term], events: Events | None,
               free: Sequence[tuple[int, str]], step: FloatArray, beta: FloatArray,
               density: FloatArray, block: slice) -> GaussianFit | None:
-    """Return the model without a block: its step, halved until it suits the other blocks."""
-    # A step of parameters that the likelihood hardly tells apart can be far too long.
+    """Return the model without a block: after a scoring step, halved until it suits the rest."""
+    # If the likelihood hardly distinguishes parameters, a step in them can be far too long.
     others = np.ones(density.size, dtype=np.bool_)
     others[block] = False
     for turn in range(_HALVINGS + 1):

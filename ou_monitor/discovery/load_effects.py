@@ -25,8 +25,8 @@ _DIGITS = (4, 6)
 _DRAWS = 8
 # Quantiles of the load between which a fall is measured.
 _FLOWN = (0.01, 0.99)
-# Maximum time between a dip and its predicted minimum, s; minimum share of its depth that is
-# predicted from the load if the load caused it.
+# Maximum time between a dip and its predicted minimum, s; a dip counts as caused by the load if
+# the load predicts more than this share of its depth.
 _NEAR, _MADE = 0.05, 0.5
 
 
@@ -39,8 +39,8 @@ def low_dips(samples: Samples, rise: FloatArray, baseline: Sequence[Term],
     rates = []
     for terms in (baseline, extended):
         try:
-            # The level is halfway between codes, whose offset the model does not know; so a
-            # voltage before the ADC dips as often as its readings.
+            # Simulate without the ADC: the model does not know the offset of its codes, and below
+            # a level halfway between codes, a voltage dips as often as its readings.
             model = SupplyModel(tuple(term for term in terms if term.NAME != Quantization.NAME))
             found = [dip_begins(model.simulate(t, rng, samples.throttle), level, rise).size
                      / minutes for _ in range(_DRAWS)]
@@ -105,7 +105,7 @@ def _path(samples: Samples, responses: Sequence[Term]) -> FloatArray:
 
 
 def _made(samples: Samples, path: FloatArray, level: float, begins: npt.NDArray[np.intp]) -> int:
-    """Return the number of dips of which the path caused more than half."""
+    """Return the number of dips that the path of the load caused."""
     v, t, made = samples.logged, samples.t, 0
     depth, usual = float(np.median(v)), float(np.median(path))
     for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), v.size]):

@@ -46,9 +46,9 @@ class Worth:
 class Pruned:
     """The remaining model, and the gain of each of its causes."""
 
-    full: HeldOut  # The model
+    full: HeldOut
     names: list[str]  # Its causes, in the order of acceptance
-    worth: list[Worth] = field(default_factory=list)  # Worth of each cause
+    worth: list[Worth] = field(default_factory=list)
     out: list[str] = field(default_factory=list)  # Removed causes
 
 

@@ -4,9 +4,9 @@ Redraw readings that the ADC clips, or rounds to codes wider than the rail's mov
 Omitting clipped samples would truncate the distribution and bias every statistic of the rest.  So
 a path of the rail is drawn given all readings, then each affected reading given the path.
 
-Rounding errors of wide codes are neither normal nor white; taken for white noise, they look like
-heavy tails or switching.  Under the right model, readings redrawn within their codes follow it
-exactly.  A further cause gains on average at most as much from redrawn readings as from the
+Rounding errors of wide codes are neither normal nor white; modelled as white noise, they look like
+heavy tails or switching.  Readings redrawn within their codes follow the model exactly if it is
+right.  On average, a further cause gains at most as much from redrawn readings as from the
 probability of the codes (Jensen's inequality).
 """
 
@@ -38,7 +38,7 @@ _COARSE = 3.0
 # Grid across a code: points per move of the rail (with two, sums are exact to 1e-9), minimum and
 # maximum points; margin beyond the code, in standard deviations of the white noise.
 _EACH, _FEWEST, _MOST, _BEYOND = 2.0, 16, 128, 3.0
-# Minimum probability, and white noise in codes: they only avoid 0/0.
+# Minimum probability, and minimum white noise in codes, which avoid 0/0.
 _NONE, _LEAST = 1e-300, 1e-9
 
 

@@ -4,8 +4,8 @@ The search for the causes that a recording shows.
 It begins with the response of the mean to throttle and time, and with the noise under load: on
 real flights they make up nearly all of the variance and hide everything else.  In each round,
 every candidate of the catalogue is then added to the model and fitted, and the one with most
-evidence is accepted.  Causes no longer worth their penalty are removed, and laws of throttle are
-exchanged for better ones.  Measured inputs come before latent causes, which can imitate them;
+evidence is accepted.  Causes no longer worth their penalty are removed, and one of `LAWS` may be
+exchanged for a better one.  Measured inputs come before latent causes, which can imitate them;
 causes that tie become alternatives.
 """
 
@@ -39,9 +39,10 @@ from ou_monitor.text import Z95
 
 Progress = Callable[[float], None]
 
-# Laws of throttle, which have similar effects on one-step errors and may be exchanged.
+# Terms by which noise or alpha depends on throttle.  Their effects on one-step errors are similar,
+# so one may be exchanged for another.
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
-# Laws of intensity over throttle: a second one may only correct the form of the first.
+# Intensity over throttle: a second of these terms may only correct the form of the first.
 _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
@@ -261,7 +262,7 @@ def _make_best_move(fitter: Fitter, search: Search) -> bool:
 
 
 def _replacements(less: Composite, name: str) -> list[type[Term]]:
-    """Return possible replacements of a law of throttle: another one, or other knots."""
+    """Return possible replacements of one of `LAWS`: another one, or other knots."""
     return [kind for kind in LAWS if kind.NAME in catalogue() and not less.has(kind.NAME)
             and (kind.CHANGES is None or less.has(kind.CHANGES.NAME))
             and (kind.NAME != name or kind is LoadDependentSigma)
@@ -284,8 +285,8 @@ def _refit(fitter: Fitter, found: Composite) -> Composite:
 
 
 def _leaves_range(fitter: Fitter, model: Composite) -> bool:
-    """Return whether sigma follows the law of noise and a simulation leaves the recorded range."""
-    # All simulations must stay within it (share 1), because the model is still Gaussian.
+    """Return whether sigma follows `LoadDependentNoise` and a simulation leaves the range."""
+    # All simulations must stay within the recorded range (share 1): the model is still Gaussian.
     follows = any(isinstance(term, LoadDependentNoise) and term.on_sigma for term in model.terms)
     return follows and outside_range(fitter.samples, model.terms, 1.0) > 0.0
 
@@ -297,8 +298,8 @@ _SLOW = 1.0
 
 def under_load(fitter: Fitter, search: Search) -> None:
     """Start from the load model: response to throttle, and noise that follows it, together."""
-    # Added one by one, each would absorb effects of the others.  Afterwards each must be worth its
-    # own penalty.
+    # If the terms were added one by one, each would absorb effects of the others.  Afterwards each
+    # must be worth its own penalty.
     load, plain = load_terms(fitter.samples), search.composite
     noisy = whole_load(fitter, plain, load)
     if noisy is None:
@@ -372,9 +373,9 @@ def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Compos
 
 def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Composite:
     """Return a model with the noise terms that have evidence."""
-    # on_sigma: whether sigma may follow the law of the white noise; False until the response to
-    # throttle is chosen, because noise with memory imitates a response.  Such a fit is rejected if
-    # simulations leave the recorded range, which one-step predictions hardly constrain.
+    # on_sigma: whether sigma may depend on throttle like the white noise; False until the response
+    # to throttle is chosen, because noise with memory imitates a response.  Such a fit is rejected
+    # if simulations leave the recorded range, which one-step predictions hardly constrain.
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)

@@ -135,7 +135,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     if not exact or gain != 0.0:
         parts.append(gain_words(gain, gain_se, why, math.nan if exact else chance))
     if together > 1 and math.isfinite(gain):
-        parts.append(f'That is the gain of all {together} terms {term.NAME} together.')
+        parts.append(f'That is the joint gain of all {together} {term.NAME} terms.')
     if alternatives:
         separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
                     for name in (term.NAME, *alternatives)]
@@ -156,9 +156,9 @@ def coupling_note(alpha: float, duration: float) -> str:
     # Evidence for an AC coupling is 0.24 alpha T nats (alpha: rate of the rail behind it; T:
     # duration).
     slowest = 0.24 * duration / 6.0
-    return (f'If the supply itself relaxes more slowly than in {number(slowest)} s, the '
+    return (f'If the supply itself takes more than {number(slowest)} s to relax, the '
             'relaxation found could come from an AC-coupled instrument (a high-pass at '
-            f'{number(alpha / (2.0 * math.pi))} Hz); a recording with a DC-coupled one decides.')
+            f'{number(alpha / (2.0 * math.pi))} Hz); a DC-coupled recording would settle it.')
 
 
 def no_relaxation_note(alpha: float, step: float) -> str:
@@ -182,7 +182,7 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), uncovered: int = 0,
                   doubts: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the verdict, a sentence each: causes, gain, whether simulations pass, refusal."""
+    """Return the verdict as sentences: causes, gain, whether simulations pass, refusal."""
     # why: reason for an unknown gain; uncovered: samples at a throttle that other blocks lack.
     if not found.causes:
         return (plain(by_load(_without_causes(found, dropped, uncovered), found.load)),)
@@ -215,7 +215,7 @@ def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> s
 
 
 def _gain(found: Finding, why: str) -> str:
-    """Return a gain in words: change of one-step errors, and of the prediction of their size."""
+    """Return a gain in words: how much one-step errors, and predictions of their size, improve."""
     gain, shrink, size = found.gain, found.shrink, found.size_gain
     if not gain > Z95 * found.gain_se or not math.isfinite(size):
         return gain_words(gain, found.gain_se, why)
@@ -387,7 +387,7 @@ def plain(text: str) -> str:
 
 
 def by_load(text: str, load: str) -> str:
-    """Return a text about throttle with the name of the load instead."""
+    """Return a text with the word throttle replaced by the load, such as current."""
     return text if load == 'none' else re.sub(r'\b([Tt])hrottle\b', lambda found: (
         load.capitalize() if found[1] == 'T' else load), text)
 

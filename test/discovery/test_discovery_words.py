@@ -182,7 +182,7 @@ def test_the_verdict_says_what_is_left_or_refused():
     assert plain_words('order line') != plain_words('line')
     # 0.24 alpha T = 6 nats; a corner is a rate over a turn.
     note = coupling_note(20.0 * math.pi, 100.0)
-    assert 'than in 4.00 s' in note and 'high-pass at 10.0 Hz' in note
+    assert 'more than 4.00 s' in note and 'high-pass at 10.0 Hz' in note
 
 
 @pytest.mark.parametrize('gain, error, text', [
