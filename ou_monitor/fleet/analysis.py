@@ -36,14 +36,14 @@ class Options:
     cells: int = 0  # Cells in series; 0: from the log, else a guess
     # Arguments of `read_recording`.
     msg_config: str | None = None
-    msg_config_hash: str = ''  # Of the file's content; a changed file is analysed again
+    msg_config_hash: str = ''  # Of the file: if it changed, the recordings are analysed again
     voltage_topic: str | None = None
     throttle_topic: str | None = None
     columns: CsvColumns | None = None
     # Whether to read the intact part of damaged bags; CSVs are always read without bad lines.
     partial: bool = False
     discover: bool = False  # Whether to search for causes: some seconds per recording
-    seed: int = 0  # Seed of `discover`
+    seed: int = 0
 
 
 def work(path: str, options: Options) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
         partial=options.partial or kind_of(Path(path)) == CSV)
     check_size(recording)
     if found := faults(recording):
-        # Not compared with the others.
+        # Such a recording is not compared with the others.
         raise InputError(' '.join(item.text for item in found))
     if options.cells:
         check_cells(full_voltage(recording), options.cells)

@@ -109,7 +109,7 @@ def _candidates(root: Path, left_out: Path | None, closed: list[str]) -> Iterato
 
 
 def _kind(path: Path) -> tuple[str, str] | None:
-    """Return None for a recording, else why it is skipped; empty: without a note."""
+    """Return None for a recording, else what is skipped and why; empty texts: without a note."""
     kind = path.suffix.lower()
     if os.path.isdir(path) or kind == '.mcap':
         return None
@@ -122,7 +122,7 @@ def _kind(path: Path) -> tuple[str, str] | None:
 
 def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
           ) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield as os.walk does, to a limited depth, because os.walk recurses into each folder."""
+    """Yield as os.walk does, but to a limited depth (in Python 3.11, os.walk is recursive)."""
     for folder, inner, names in os.walk(root, onerror=onerror):
         if folder.count(os.sep) - str(root).count(os.sep) >= _MOST_DEPTH and inner:
             inner.clear()

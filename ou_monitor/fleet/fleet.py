@@ -70,7 +70,7 @@ class SavedResults:
                                + '.json')
 
     def load(self, source: FoundRecording) -> dict[str, Any] | None:
-        """Return the result of a recording; None if there is none; a foreign file is refused."""
+        """Return the saved result of a recording or None; refuse a file not written by fleet."""
         path = self._path(source)
         try:
             with open_regular(path) as file:
@@ -96,7 +96,7 @@ class Fleet:
     """Result of analysing a fleet."""
 
     rows: list[Row]  # The table, in order of vehicle, flight, path and level
-    judgement: Judgement  # What stands out
+    judgement: Judgement
     notes: tuple[str, ...]  # How vehicles were named, skipped files, and the like
     recordings: int  # Recordings found
     limit: float = NAN  # Voltage below which dips are counted, V; NaN when none was given

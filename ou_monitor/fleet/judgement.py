@@ -13,8 +13,9 @@ Drift: a line through the logarithms against flight number.  Weights come from t
 normal scatter between flights (Paule and Mandel).  The scale of the t test is the scatter about
 the line, so an error common to all flights does not count.
 
-Fewer than `LEAST_VEHICLES` vehicles: each is compared with the mean of the others by a t test,
-scaled by the pooled scatter between flights; packs only with packs of the same number of cells.
+Fewer than `LEAST_VEHICLES` vehicles with packs of the same number of cells: resistance and sag of
+each are compared with the mean of the others by a t test, scaled by the pooled scatter between
+flights.
 
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
 divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between recordings, a
@@ -77,7 +78,7 @@ class CommonCurve:
 class Values:
     """One quantity of every recording that has it."""
 
-    name: str  # Quantity
+    name: str
     paths: tuple[str, ...]  # Recordings
     vehicles: tuple[str, ...]  # Vehicle of each; empty where unknown
     flights: IntArray  # Number of the flight; 0 where unknown; shape (n,)
@@ -346,7 +347,7 @@ _MEDIAN = 0.6744897501960817
 # Minimum size of a group: in a smaller one, any member may be the outlier.
 LEAST = 4
 SIMULATIONS = 4000  # Simulated fleets
-# Maximum number of cells simulated at once; limits memory.
+# Maximum number of values simulated at once; limits memory.
 _CELLS = 2_000_000
 # One-sided 90 % bound of a normal distribution, in standard deviations.
 _UPPER = 1.2815515655446004
@@ -454,7 +455,7 @@ _MEDIAN_ERROR = 1.2533141373155
 class VehicleValues:
     """One quantity of every vehicle: the medians of its recordings."""
 
-    names: tuple[str, ...]  # Vehicles
+    names: tuple[str, ...]
     value: FloatArray  # Medians on the scale of `Values.value`; shape (v,)
     outliers: Outliers  # How far each is from the fleet
     cells: tuple[int, ...]  # Cells by which the values of each are divided; 0: they are not
@@ -494,7 +495,7 @@ def _largest_first(outliers_of: Mapping[str, Outliers]) -> list[tuple[str, int]]
 
 
 def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
-    """Return what stands out."""
+    """Return drifts, and outliers among recordings and vehicles."""
     values = {name: values_of(rows, name) for name in QUANTITIES}
     tested = trends(tuple(values.values()))
     # Each quantity is compared twice: among the recordings of a vehicle, and among vehicles.
@@ -530,7 +531,7 @@ def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: 
         one = np.sqrt(np.mean(scatter ** 2 + values.error[mine] ** 2) / mine.size)
         # The median of two is their mean.
         error[k] = one * (_MEDIAN_ERROR if mine.size > 2 else 1.0)
-    # Packs with different numbers of cells belong to different crafts.
+    # Packs with different numbers of cells belong to different craft.
     cells = tuple(int(values.cells[mine].max()) for mine in of)
     found = outliers(value, error, [f'{one} cells' for one in cells], rate, least=LEAST_VEHICLES,
                      seed=seed)

@@ -23,7 +23,7 @@ Row = dict[str, Any]
 class Column:
     """One column."""
 
-    name: str  # Name in the table
+    name: str
     # ``text``, ``texts`` (a list), ``json``, ``number`` (unknown: null), ``count`` or
     # ``time`` (UTC).
     kind: str

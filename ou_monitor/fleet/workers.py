@@ -30,7 +30,7 @@ from urllib.parse import urlsplit
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.mcap_file import usable_memory
 
-# Several processes with several threads of linear algebra each are slower than with one thread.
+# Several processes with several threads of linear algebra each are slower than with one each.
 _ONE_THREAD = dict.fromkeys(
     ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
 # Share of the memory that all workers together may use, and the minimum for one, bytes.
@@ -238,12 +238,12 @@ class ClusterWorkers(Workers):
         except (OSError, TypeError, ValueError) as error:
             raise InputError(f"--scheduler: no scheduler answers at '{address}' "
                              f"({str(error).splitlines()[0] if str(error) else 'time-out'}); "
-                             "start one by 'dask scheduler'; doc/security.md explains certificates"
-                             ) from error
+                             "start one with 'dask scheduler'; doc/security.md explains "
+                             'certificates') from error
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError as error:
-            raise InputError(f"--scheduler: '{address}' has no worker; start one by "
+            raise InputError(f"--scheduler: '{address}' has no worker; start one with "
                              f"'dask worker {address}'") from error
         try:
             there = set(client.run(check).values())
@@ -258,7 +258,7 @@ class ClusterWorkers(Workers):
         return client
 
     def _room(self) -> int:
-        # Two tasks a thread, so that no worker idles between tasks.
+        # Two tasks per thread, so that no worker is idle between tasks.
         return 2 * max(1, sum(int(count) for count in self._client.nthreads().values()))
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:

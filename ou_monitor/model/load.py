@@ -8,9 +8,9 @@ v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))
 x = ul^p (E/3.8)^(p-1) exp(-2 h), ul = LP(u, lag), dq = x dt / (mean x T), dh = (sag/V) dq,
 with u throttle, E(s) of `open_circuit`, h Ohmic heat, and LP(x, tau) a low-pass of order 1.
 
-The start values (the response to throttle at take-off) come from one craft and one pack on one
-day; the filter widens their errors by the scatter between packs.  They contain no level, because
-the charge at take-off is unknown.
+The start values (`LoadStart`: the response to throttle, known at take-off) come from one craft and
+one pack on one day; the filter widens their errors by the scatter between packs.  They contain no
+level, because the charge at take-off is unknown.
 """
 
 from __future__ import annotations
@@ -160,9 +160,9 @@ LAGS = (0.06, 0.35, 2.0, 15.0)
 LINEAR_LAGS = (0.35, 2.0)
 # Number of coefficients: of x = u^1.8, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush.
 SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
-# Indices of the coefficients of former model files, which lack x after 0.35 s and u after lags.
+# Indices of the coefficients of old model files, which lack x after 0.35 s and u after lags.
 _FORMER = (0, 1, 2, 3, 5, 6, SIZE - 1)
-# Number of fields, the last of LoadStart, that a model file may omit.
+# Number of fields at the end of LoadStart that a model file may omit.
 _OPTIONAL = 9
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
@@ -240,7 +240,7 @@ class LoadStart:
 
 
 def _present(values: dict[str, Any]) -> dict[str, Any]:
-    """Add the coefficients that a former file lacks: zero, with their prior variance."""
+    """Add the coefficients that an old file lacks: zero, with their prior variance."""
     try:
         a, P = np.array(values['coefficients']), np.array(values['covariance'])
     except ValueError:

@@ -1,9 +1,9 @@
 """
 The load model of a recording: a maximum a posteriori fit.
 
-Limits: the priors are narrow, to bound parameters that the recording does not determine; a fitted
-parameter three prior standard deviations off shows that the form of the model is wrong.
-Residuals are modelled as white noise and an OU of 20 s and of a few mV.
+Limits: the priors are narrow, to bound parameters that the recording does not determine; if a
+fitted parameter is three prior standard deviations from its centre, the model's form is wrong.
+Residuals are modelled as white noise and an OU with a time constant of 20 s and a few mV rms.
 """
 
 from __future__ import annotations
@@ -153,7 +153,8 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     inside = abs(best) < max(found)
     best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
     # A delay wrong by half a sample leaves glitch-like errors at steep changes of the load.  But a
-    # fine shift also smooths a noisy load, so it must beat a mean of both shifts, which does too.
+    # shift by part of a sample also smooths a noisy load.  So it must fit better than the mean of
+    # this shift and the opposite one, which is equally smooth.
     fine = {k: fit(1, best + k)[0] for k in range(-_SHIFTS, _SHIFTS + 1)}
     k = min(sorted(fine, key=abs), key=lambda k: fine[k])
     pays = min(fine[0], fit(1, best + k, best - k)[0]) > fine[k] * t.size ** (1.0 / t.size)
@@ -196,7 +197,7 @@ class _Noise:
     def evidence(self, residuals: FloatArray) -> float:
         """Return the log-likelihood, nats, of innovations under Student's t, 4 degrees."""
         z, variance, _ = self.whiten(residuals)
-        # With normal tails, the squares of a few short full-throttle bursts would decide.
+        # With normal tails, a few short bursts of full throttle would dominate.
         return float(max(np.sum(-2.5 * np.log1p(0.25 * (z / size) ** 2)) + z.size * math.log(
             0.375 / size) for size in _SIZES) - 0.5 * np.log(variance).sum())
 

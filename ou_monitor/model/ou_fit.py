@@ -18,8 +18,9 @@ changes of the level that the hats miss and that would be fitted as a slow OU.
 
 Limits: samples are treated as evenly spaced between gaps; a relaxation slower than 2.5 s (a sixth
 of a window below 15 s) counts as level; OU and white noise are assumed to change in proportion,
-and results are for their mean size.  Wrongly fitted as OU: repeats or rounding of slow changes, a
-load that neither throttle nor current shows, and noise with another spectrum (a filtered sensor).
+and results are for their mean size.  Repeats or rounding of slow changes, a load that neither
+throttle nor current shows, and noise with another spectrum (a filtered sensor) are wrongly fitted
+as OU.
 
 Coverage of the 95 % intervals on 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s,
 50 to 1000 Hz, OU of 20 mV, white noise to 30 mV, windows of 20 s, or 8 s above 300 Hz): alpha 93 %
@@ -54,8 +55,8 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
-# Minimum gap, in median steps: to split the data at smaller ones would cost more accuracy than
-# their error in time.  Minimum number of readings between gaps.
+# Minimum gap, in median steps: splitting the data at smaller gaps would cost more accuracy than
+# ignoring them.  Minimum number of readings between gaps.
 _GAP, _STRETCH = 5.0, 16
 # Minimum share of the readings that pieces of equal length must contain.
 _HELD = 0.8
@@ -91,7 +92,7 @@ _IMPRECISE = 0.37
 # Usual walk of the level, V per sqrt(s) and cell; above it, prior standard deviation of its
 # logarithm.  Walks of .0015 to .015 fit the recordings.
 _WALK, _WALK_SD = 0.004, 0.8
-# Maximum alpha dt: beyond, neighbouring readings are uncorrelated.
+# Maximum alpha dt: beyond it, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
 # A window is too short if the interval of alpha begins within this factor of the slowest rate.
 _EDGE = 1.25
@@ -287,11 +288,11 @@ def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
 
 
 class NoiseSize:
-    """Size of the noise: ln(size) is linear in ln(1 + scaled load sign), within fitted limits."""
+    """Size of the noise: its ln is linear in ln(1 + scaled `load_signs`), within fitted limits."""
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
-        # A constant sign carries no information.
+        # A constant row carries no information.
         self._used = (signs != signs[:, :1]).any(axis=1)
         self._scale = 0.3 * np.sqrt((signs[self._used] ** 2).sum(axis=1, keepdims=True) / n)
         logs = self._logs(signs)
@@ -328,7 +329,7 @@ class NoiseSize:
         return np.asarray(np.sqrt(variance / variance.mean()))
 
     def of(self, signs: FloatArray) -> FloatArray:
-        """Return the size of the noise, V, at load signs, by the last fit."""
+        """Return the size of the noise, V, for `load_signs`, by the last fit."""
         X = np.vstack([np.ones(signs.shape[1]), self._logs(signs) - self._mean])
         return np.asarray(self._rms * np.exp(0.5 * np.clip(self._beta @ X, *self._ends)))
 
@@ -342,8 +343,8 @@ class _Likelihood:
 
     def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return minus the log-likelihood, and the variance of OU plus white noise, V^2."""
-        # Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln(walk), the walk
-        # being the ratio of two variances: a step of the level, and OU plus white noise.
+        # Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln(walk).  Walk is the
+        # variance of a step of the level, divided by the variance of OU plus white noise.
         half = points.shape[0] // 2
         if half and points.shape[0] * self._cross.size > _AT_ONCE:
             value, variance = zip(self.at(points[:half]), self.at(points[half:]))
@@ -470,7 +471,7 @@ def white_variance(ou: OuFacts, steps: float, dt: float) -> float:
 
 
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:
-    """Fit the shortest of OU_WINDOWS, all ending with the readings, that is precise enough."""
+    """Fit the shortest of OU_WINDOWS at the end of the readings that is precise enough."""
     if not t.size:
         return OuFacts('no_data')
     t, v = t[-MOST_READINGS:], v[-MOST_READINGS:]
