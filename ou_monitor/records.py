@@ -172,8 +172,8 @@ class Status(enum.Enum):
         'The relaxation is buried in measurement noise: alpha is uncertain by a factor of more '
         'than 2.6; lengthen the window or use a finer ADC.')
     NO_RELAXATION = (
-        'No relaxation visible at this rate: the noise has no memory, so it is of the sensor, or '
-        'faster than the sampling. Slow changes count as changes of the level.')
+        'No relaxation visible at this rate: the noise has no memory, so it comes from the '
+        'sensor, or is faster than the sampling. Slow changes count as changes of the level.')
     UNTIMED = (
         'The sample times are not trusted, so no rate can be estimated: see the reason.')
 

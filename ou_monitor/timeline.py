@@ -308,7 +308,8 @@ def _unsigned(recording: Recording) -> Recording:
         return recording
     return replace(recording, throttle=np.abs(u), notes=(*recording.notes, (
         f'Throttle runs from {float(np.nanmin(u)):.3g} to {float(np.nanmax(u)):.3g}, and the '
-        'voltage falls in both directions: its absolute value is used. The node needs it so.')))
+        'voltage falls in both directions: the absolute value of throttle is used. For the node, '
+        'publish that value.')))
 
 
 def _explained(y: FloatArray, x: FloatArray) -> float:

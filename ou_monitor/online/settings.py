@@ -92,8 +92,8 @@ class MonitorSettings:
         AUTO, 'Length of the sliding window, s; auto: the shortest of 2, 8, 30 and 60 s in which '
         'alpha is known within a factor of 1.5, else the longest.', 0.05, 3600.0, (AUTO,))
     stale_after: float = _parameter(
-        1.0, 'Silence after which the input counts as stale, s.  A fast source needs less (300 '
-        'intervals, but at least 0.3 s), a slow one more (2.5 intervals).',
+        1.0, 'Silence after which the input counts as stale, s.  It is shorter for a fast source '
+        '(300 intervals, but at least 0.3 s), longer for a slow one (2.5 intervals).',
         0.01, 3600.0)
     brownout_voltage: float = _parameter(
         DEFAULT_LIMIT, 'Lowest permitted supply voltage, V (default: the lower limit of PX4 for a '

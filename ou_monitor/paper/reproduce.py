@@ -114,15 +114,15 @@ def _coupling(rows: Sequence[Row]) -> str:
     alpha = published.ALPHA.text
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
             f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
-            f'it a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {fitted.recomputed:.1f} 1/s, '
-            f'and of any change of its rate the reading shows only {100 * slope.recomputed:.1f} '
-            f'+- {100 * (slope.error or 0.0):.1f} %. The reading never exceeds the '
-            f'corner, and a rail slower than the corner is read slower: with that coupling, Fig. '
-            f'5 ({line.alpha:.1f} +- {line.half_width:.1f} 1/s) shows that the rail is faster '
-            f'than about {transient.slowest_rail():.0f} 1/s, not that it is {alpha}. An OU of '
-            f'{alpha} 1/s would keep {100 * kept:.0f} % of its standard deviation behind it, so '
-            'Vrms would be too low as well. DC coupling, or a measured corner of the instrument, '
-            'would decide.')
+            f'it, a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {fitted.recomputed:.1f} '
+            f'1/s, and the reading shows only {100 * slope.recomputed:.1f} '
+            f'+- {100 * (slope.error or 0.0):.1f} % of a change of its rate. The reading never '
+            f'exceeds the corner, and a rail slower than the corner is read as slower: with that '
+            f'coupling, Fig. 5 ({line.alpha:.1f} +- {line.half_width:.1f} 1/s) shows that the '
+            f'rail is faster than about {transient.slowest_rail():.0f} 1/s, not that it is '
+            f'{alpha}. Behind the coupling, an OU of {alpha} 1/s would keep {100 * kept:.0f} % of '
+            'its standard deviation, so Vrms would be too low as well. DC coupling, or a measured '
+            'corner of the instrument, would decide.')
 
 
 def _exponential(rows: Sequence[Row]) -> str:
