@@ -67,7 +67,7 @@ def write_attribute(path: Path, value: object) -> None:
 def reason_of(error: OSError) -> str:
     """Return the reason for a file error, and the remedy."""
     if error.errno in (errno.EACCES, errno.EPERM):
-        return ('not permitted; give the user of this node the right by a udev rule or a group '
+        return ('not permitted; give the user of this node access by a udev rule or a group '
                 '(doc/deploy.md)')
     if error.errno == errno.EBUSY:
         return 'the device is in use by another program'
@@ -185,7 +185,7 @@ def parse_element(name: str, index: int, kind: str) -> Element:
     found = Element(name, index, '<' if order == 'le' else '>', sign == 's', int(bits),
                     int(storage), int(shift))
     if found.storage not in (8, 16, 32, 64) or int(repeat) > 1:
-        raise InputError(f"{name}_type is '{kind}': 8, 16, 32 or 64 bits of storage, without "
+        raise InputError(f"{name}_type is '{kind}': only 8, 16, 32 or 64 bits of storage, without "
                          'repetition, can be read')
     if not 0 < found.bits <= found.storage - found.shift:
         raise InputError(f"{name}_type is '{kind}': {found.bits} bits do not fit")

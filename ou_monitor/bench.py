@@ -437,9 +437,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         else:
             level, source = default_voltage(cells, full)
             if origin == 'guessed':
-                source += (f', {counted(cells, "cell")} guessed from the voltage: --cells N for '
-                           'others, --set cells=0 with --brownout-voltage V for a rail or '
-                           'lead-acid')
+                source += (f', {counted(cells, "cell")} guessed from the voltage: --cells N '
+                           'overrides it; for a rail or lead-acid, give --set cells=0 and '
+                           '--brownout-voltage V')
         flight, facts, risk_of = _flight(
             flown, full, cells, level if rail == 'bus' else None, horizon, risk)
         if load and not flight.resistance > 0.0:

@@ -154,7 +154,7 @@ def test_missing_permission_is_reported(tmp_path, monkeypatch):
     def refuse(*args, **kwargs):
         raise PermissionError(13, 'Permission denied')
     with monkeypatch.context() as patch, pytest.raises(
-            InputError, match='not permitted; give the user of this node the right'):
+            InputError, match='not permitted; give the user of this node access'):
         patch.setattr(os, 'open', refuse)
         IioBuffer(folder, character, 'in_voltage1')
 

@@ -153,7 +153,7 @@ def check_cells(full: float, cells: int) -> None:
             + ('the voltage seems to be in mV or counts (--unit mV)' if full > MOST_SUPPLY else
                f'it is likely {counted(likely, "cell")} (lithium)' if (likely := cell_count(full))
                else 'no number of charged lithium cells fits')
-            + '; for lead-acid, or a rail that is no battery, leave --cells out and give '
+            + '; for lead-acid, or a rail that is not a pack, leave --cells out and give '
             '--brownout-voltage V')
 
 

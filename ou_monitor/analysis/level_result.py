@@ -22,8 +22,8 @@ stationary OU levels has any rejection.  The first rule that applies names the l
    independent innovations, or a second one is detected: 'stationary stochastic';
 7. otherwise 'diffusion', or 'undetermined' without a usable fit.
 
-Limits: the power of the tests depends on the length of the level; impulses cannot be told from an
-intensity that changes within a block.
+Limits: the power of the tests depends on the length of the level; impulses cannot be distinguished
+from an intensity that changes within a block.
 """
 
 from __future__ import annotations
@@ -234,8 +234,8 @@ def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
             frequency, density = welch(recording.voltage[s.start:s.stop], fs=rate,
                                        nperseg=length, detrend='constant')
             summed, weight = summed + n * density, weight + n
-    # Without the first two bins, which the removal of the mean distorts, and the last, at the
-    # Nyquist frequency, which is not doubled like the others.
+    # Leave out the first two bins, which the removal of the mean distorts, and the last, at the
+    # Nyquist frequency, whose density is not doubled.
     frequency, density = even_on_log(frequency[2:-1], summed[2:-1] / weight, _PER_DECADE)
     fitted = np.full(frequency.size, math.nan)
     if estimate.usable:

@@ -293,7 +293,7 @@ def _portmanteau(name: str, parts: Sequence[FloatArray], lags: int) -> TestResul
         se = math.sqrt(max(variance, 1e-300)) / total
         q += (r / se) ** 2
         squares += max(0.0, r * r - se * se)
-    # Of the fitted parameters, only the white noise has an effect at so few lags.
+    # Of the fitted parameters, only the white noise has an effect at these few lags.
     freedom = lags - 1.0 if name == 'one_relaxation' else freedom
     return TestResult(name, float(stats.chi2.sf(q, freedom)), math.sqrt(squares))
 

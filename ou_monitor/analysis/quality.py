@@ -44,7 +44,7 @@ _BEWARE = {
         'Beware: the voltage is negative throughout: swap the leads of the sensor, or change the '
         'sign.'),
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
-    'TIME_UNIT': 'Beware: the time seems to be in a smaller unit.'}
+    'TIME_UNIT': 'Beware: the time seems to be in a unit smaller than seconds.'}
 # Minimum readings of a constant voltage for a stuck sensor.
 _STUCK_READINGS = 10
 

@@ -358,7 +358,7 @@ _DESIGN = Command(
     'power network, for a range of bulk capacitances, and find the smallest that meets a risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a recording; --set overrides it '
-            '(cells=0: the voltage is that of a rail)'),
+            '(cells=0: the voltage is of a rail, not a pack)'),
      Option('--risk', metavar='X', type=PROBABILITY, default=0.01,
             help='probability of a brown-out allowed within the horizon, 0..1 (default: '
             '%(default)s, as for the throttle budget of analyze)'),

@@ -4,9 +4,9 @@ A model of one flight, fitted to a part of it, that can be simulated over any th
 The load is fitted first, and kept if it has clearly more evidence than a level alone.  The
 residual is an OU in white noise; the size of both follows the load and its changes (`NoiseSize`).
 
-Limits: errors come from four held-out parts, so a lasting change after the fitted part is not
-covered; one OU describes all correlated noise, and its size and the size of the white noise follow
-the load in the same way; readings are treated as evenly spaced.
+Limits: errors are estimated from four held-out parts, so a lasting change after the fitted part is
+not covered; one OU describes all correlated noise; the sizes of OU and white noise follow the load
+in the same way; readings are treated as evenly spaced.
 """
 
 from __future__ import annotations
@@ -379,8 +379,9 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 def _sag_error(samples: Readings, load: _Load) -> float:
     """Return the relative error of the mean sag of two held-out parts."""
-    # In each held-out part, the voltage is regressed on the predicted path; parts that move more
-    # have more weight.  Temperature, wind and simplifications of the load model change the ratio.
+    # In each held-out part, the voltage is regressed on the predicted path.  Temperature, wind and
+    # simplifications of the load model make the slope differ from 1.  Parts in which the path
+    # moves more have more weight.
     squares, weights = [], []
     for (fit, errors), part in zip(load.parts, _parts(samples)):
         path = _path(samples, fit, load.current)[part]

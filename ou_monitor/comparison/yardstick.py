@@ -341,7 +341,8 @@ class Difference:
 
 def band(measured: float, simulated: FloatArray) -> Band:
     """Return a number of the recording with the band of the simulations, shape (seeds,)."""
-    # 95 % of further simulations lie in low..high (of 50, NumPy's default method gives 91 %).
+    # By this method, 95 % of further simulations lie in low..high; by NumPy's default method, 91 %
+    # do if the band is from 50 simulations.
     low, median, high = np.percentile(simulated, [_LOW, 50.0, _HIGH], method='weibull').tolist()
     return Band(measured, low, median, high)
 

@@ -27,7 +27,7 @@ _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
 # Processor time of the fastest law with a `SLOW_FIT`, s per sample.
 LAW_COST = 1e-5
-# Fits a law for the first time.
+# A function that fits a law for the first time.
 LawFitter = Callable[[type[Term], View], LawFit | None]
 
 

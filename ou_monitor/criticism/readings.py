@@ -152,8 +152,8 @@ def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
     spread = columns.std(axis=1)
     trend = np.stack([np.ones(t.size), (t - t.mean()) / max(float(np.ptp(t)), 1e-300)])
     both = np.concatenate((trend, columns[spread > 0.0] / spread[spread > 0.0, None]))
-    # The noise is taken as an AR(1) with the coefficient of its slowest part, so that a wandering
-    # level is not mistaken for a response.
+    # The noise is modelled as an AR(1) with the coefficient of its slowest part, so that a
+    # wandering level is not mistaken for a response.
     without, left = (_rest(v, x, 0.0) for x in (trend, both))
     slow = _slowest(left)
     alone = min(_squares(v, trend, phi) for phi in (slow, _slowest(without)))
@@ -318,7 +318,7 @@ def why_no_model(v: FloatArray) -> str:
 
 
 def _drop_implausible(u: FloatArray, notes: list[str]) -> FloatArray:
-    """Return throttle, NaN where far outside 0..1; note values outside."""
+    """Return throttle with NaN where it is far outside 0..1; note all values outside."""
     with np.errstate(invalid='ignore'):
         wild = np.abs(u) > _MOST
     if wild.any():

@@ -351,8 +351,8 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         gain = float(better.density.sum()) - value
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
-        # If a step gains what the parabola predicts, the maximum is reached.  A full fit goes on,
-        # because its standard errors need the slopes at the maximum.
+        # If a step gains what the parabola predicts, the maximum is reached.  A full fit
+        # continues, because its standard errors need the slopes at the maximum.
         if gain < (_NEARLY if rough else _SETTLED) or (
                 rough and abs(gain - predicted) < _NEARLY):
             break

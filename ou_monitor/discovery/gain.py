@@ -66,7 +66,8 @@ def if_known(gain: float, error: float) -> tuple[float, float]:
 def without(samples: Samples, model: Composite, *indices: int, plain: Composite | None = None
             ) -> Composite | None:
     """Return the model fitted to everything without some of its terms; None if that fails."""
-    # If it is worse than the plain fit, it has not converged, and is repeated from another start.
+    # If the fit is worse than the plain one, it has not converged, and is repeated from another
+    # start.
     kept = _complete(term for k, term in enumerate(model.terms) if k not in indices)
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
     known = None if laws else model

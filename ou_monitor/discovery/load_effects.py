@@ -48,7 +48,7 @@ def low_dips(samples: Samples, rise: FloatArray, baseline: Sequence[Term],
             found = [NAN, NAN]
         rates.append((float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))))
     responses = _responses(samples, extended)
-    # Poisson error, at least that of one dip.
+    # Poisson error, at least the error of one dip.
     return LowDips(level, int(begins.size),
                    _made(samples, _path(samples, responses), level, begins) if responses else None,
                    begins.size / minutes, rates[0][0], rates[1][0],

@@ -97,7 +97,7 @@ def mean_response(samples: Samples, composite: Composite, view: View,
 def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
     """Return a response with refined time constants and delays; so far they are from a list."""
     # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
-    # which would be taken for a slow OU.
+    # which would be mistaken for a slow OU.
     terms, worth = found.terms, found.worth
     step = float(np.median(samples.step[1:]))
     for octaves in _FINER:
@@ -206,7 +206,7 @@ class _Regression:
         return chosen
 
     def _has_twins(self, chosen: tuple[int, ...]) -> bool:
-        """Return whether two time constants are too near to be told apart."""
+        """Return whether two time constants are too close to be distinguished."""
         return any(_is_near(one, other)
                    for one, other in combinations([self._pool[k] for k in chosen], 2))
 

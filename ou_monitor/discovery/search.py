@@ -161,7 +161,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
            ) -> list[Trial]:
     """Return the trials of a round that may be accepted, best first."""
     # A measured input comes before latent causes only if it gains throughout the recording: a few
-    # outliers at one throttle imitate a response.
+    # outliers at one throttle can imitate a response.
     trials: list[Trial] = []
     for first in (True, False)[:1 + latent]:
         kinds = decision.kinds_to_try(

@@ -1,7 +1,7 @@
 """
 A finding in words: verdict, causes, gains, remaining discrepancies, and what would settle them.
 
-`cause_rows` are the rows of the table of causes.
+`cause_rows` returns the rows of the table of causes.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def _before_blocks(padded: FloatArray, start: FloatArray) -> FloatArray:
         if j % _EVERY == 0:
             total = whole.sum(axis=(0, 1))
             whole = whole / np.where(total > 0.0, total, 1.0)
-    # For so few numbers, plain Python is faster than arrays.
+    # For these few numbers, plain Python is faster than arrays.
     fresh = law = (start / start.sum()).tolist()
     first = []
     for product in whole.transpose(2, 0, 1).tolist():

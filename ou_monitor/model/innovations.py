@@ -42,7 +42,7 @@ class Filter:
     """Kalman filter of a model.  Raises ValueError if a covariance is singular or not finite."""
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
-        # Number of samples to filter; after those of the model, matrices and gain are constant.
+        # Number of samples to filter; beyond the model's samples, matrices and gain are constant.
         self._n = model.f.shape[0] if n is None else n
         # Number of samples with their own gain, and number of states.
         self.shape = (model.f.shape[0], model.f.shape[1])

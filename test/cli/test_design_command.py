@@ -198,7 +198,7 @@ def test_a_voltage_that_fits_no_pack_is_a_rail(tmp_path, capsys):
 
 @pytest.mark.parametrize('volts, level, said', [
     (5.08, 4.5, '5 V rail in PX4'), (3.31, 2.88, 'STM32F405'), (6.0, 4.5, '5 V rail in PX4'),
-    (12.0, 9.9, '3 cells guessed from the voltage: --cells N for others, --set cells=0 with')])
+    (12.0, 9.9, '3 cells guessed from the voltage: --cells N overrides it; for a rail')])
 def test_a_recorded_rail_is_the_source(volts, level, said, tmp_path, capsys):
     """A regulator of 0.1 Ohm, up to 2 A: mean = level - R I, and one pole, 1 / ((R + ESR) C)."""
     path = rail(tmp_path, volts, 0.2, 0.003, amperes=2.0)

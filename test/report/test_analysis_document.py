@@ -38,7 +38,7 @@ def test_headline_warns_of_what_changes_its_own_numbers():
     slow = replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
                    throttle=simulated.throttle[::20], current=None)
     found = analyze(slow)
-    assert answer(found)[0] == 'Beware: the time seems to be in a smaller unit.'
+    assert answer(found)[0] == 'Beware: the time seems to be in a unit smaller than seconds.'
     assert 'TIME_UNIT' in {item.name for item in found.quality}
     # Dates since 1970 are in s.
     dated = analyze(replace(slow, t=1.7e9 + slow.t))
