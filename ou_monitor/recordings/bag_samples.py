@@ -142,7 +142,7 @@ def _throttle(
             if one is not None and one.type == topics[topic]:
                 return replace(one, topic=topic), ()
         raise InputError(f"{path}: throttle topic '{topic}' is {topics[topic]}, which no msg "
-                         'config reads: name one in a YAML file of your own')
+                         'config reads: describe it in a YAML file of your own')
     if spec is None:
         return None, (f"Msg config '{config.name}' has no throttle, so throttle is unknown.",)
     found = _by_name(spec, topics)
