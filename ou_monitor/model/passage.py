@@ -15,14 +15,14 @@ g = exp(-s) phi(y) / Phi(-y), the backward equation P_s = P_xx - x P_x becomes
 
     R_lambda = R_ww + R_w^2 + (w (1 - 2 T) + b sqrt(T) - 2 g) R_w - b sqrt(T) g,
 
-which is solved once for all barriers by linearly implicit steps (BDF2) and kept
-as a table with cubic splines.  Because R is a logarithm, the relative error of
-small probabilities is small too.
+It is solved once for all barriers by linearly implicit steps (BDF2), and R is
+interpolated in a table by cubic splines.  Because R is a logarithm, the relative
+error of small probabilities is small too.
 
-Limits: errors are within 0.15 % of P for barriers -3..30, starts above -10 and P
-down to 1e-12 (compared with finer grids).  Outside the table, values are
-approximate: the problem is scaled into it, as if the pull towards the mean were
-constant near the barrier.
+Limits: the error is at most 0.15 % of P for barriers -3..30, starts above -10 and
+P down to 1e-12 (compared with finer grids).  Outside the table, values are
+approximate: the problem is scaled into the table, as if the pull towards the mean
+were constant near the barrier.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _LOG_TWO_PI = math.log(2.0 * math.pi)
 _NEVER = 26.0
 
 
-# Below this, ln Phi comes from the asymptotic series, with errors up to 1e-12 (Abramowitz & Stegun
-# 26.2.12, last term first); erfc loses digits below -37.
+# Below _FAR, ln Phi comes from the asymptotic series, with errors up to 1e-12 (Abramowitz & Stegun
+# 26.2.12, last term first), because erfc loses digits below -37.
 _FAR = -20.0
 _SERIES = (10395.0, -945.0, 105.0, -15.0, 3.0, -1.0, 1.0)
 
 
 def normal_below(x: npt.ArrayLike) -> FloatArray:
-    """Return Phi(x), elementwise, without SciPy, which would take 35 MB in the nodes."""
+    """Return Phi(x), elementwise, without `scipy.special`, which takes 35 MB in a node."""
     z = np.asarray(x, dtype=np.float64) * -math.sqrt(0.5)
     values = np.array([math.erfc(each) for each in z.ravel().tolist()])
     return np.asarray(0.5 * values.reshape(z.shape))
@@ -90,7 +90,7 @@ def mean_first_passage(start: float, barrier: float) -> float:
         return 0.0
     if barrier > _NEVER:
         return math.inf
-    # Imported here, because the nodes do not need it: SciPy takes 60 MB.
+    # Imported here, because the nodes do not need these modules, which take 60 MB.
     from scipy.integrate import quad
     from scipy.special import erfcx
     total, _ = quad(lambda z: float(erfcx(-z / math.sqrt(2.0))), start, barrier,
@@ -100,14 +100,14 @@ def mean_first_passage(start: float, barrier: float) -> float:
 
 def passage_probability(start: npt.ArrayLike, barrier: npt.ArrayLike, span: npt.ArrayLike
                         ) -> FloatArray:
-    """Return the probability that a unit OU rises through a barrier within a span."""
+    """Return the probability that a unit OU reaches a barrier within a span, elementwise."""
     x, b, s = np.broadcast_arrays(np.asarray(start, np.float64), np.asarray(barrier, np.float64),
                                   np.asarray(span, np.float64))
     if (s < 0.0).any():
         raise ValueError('span must be zero or positive, in relaxation times')
     shape = x.shape
     x, b, s = x.ravel(), b.ravel(), s.ravel()
-    # Also false for NaN.
+    # False where a value is NaN.
     inside = (x < b) & (s > 0.0) & (x > -np.inf) & (b < np.inf)
     if inside.all():
         return prepare().probability(x, b, s).reshape(shape)
@@ -123,15 +123,14 @@ class PassageTable:
     """Spline table of R."""
 
     coefficients: FloatArray  # Spline coefficients of R; shape (barriers, w, lambda)
-    # Spline coefficients of the logarithm of the long-run rate of passages, 1/tau; shape
-    # (barriers,).
+    # Spline coefficients of ln of the long-run rate of passages, 1/tau; shape (barriers,).
     log_rate: FloatArray
 
     def probability(self, x: FloatArray, b: FloatArray, s: FloatArray) -> FloatArray:
         """Return probabilities for start < barrier and span > 0; only the span may be infinite."""
         with np.errstate(under='ignore', over='ignore'):
-            # Near a far barrier, and within a short span, the pull is constant: then
-            # only b sqrt(s) and (b - x) / sqrt(s) matter.
+            # Near a far barrier, or within a short span, the pull is nearly constant: then the
+            # probability depends only on b sqrt(s) and (b - x) / sqrt(s).
             scale = np.maximum(np.maximum(b / _B_HIGH, b / _B_LOW), 1.0)
             gap, b, s = (b - x) * scale, b / scale, s * (scale * scale)
             short = np.sqrt(np.minimum(s / _S_LOW, 1.0))
@@ -156,7 +155,7 @@ class PassageTable:
 
 
 def prepare() -> PassageTable:
-    """Return the table; the first call, in any thread, takes tenths of a second."""
+    """Return the table; the first call takes tenths of a second, in any thread."""
     global _table
     if _table is None:
         with _lock:
@@ -294,7 +293,7 @@ def _log_rate(b: FloatArray) -> FloatArray:
     """Return ln of the long-run passage rate, 1/tau: the smallest nu with D_nu(-b) = 0."""
     # D is the parabolic cylinder function.  For 0 < b <= 8, nu comes from the power series of the
     # Hermite function, in which only the first term is negative: nu = 2 Gamma(1 - nu/2) / sum over
-    # n >= 1 of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, it comes from the asymptotic
+    # n >= 1 of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, nu comes from the asymptotic
     # series of the mean time, 1/nu; for b <= 0, from `_lowest_energy`.
     result = np.empty(b.size)
     n = range(1, 260)
@@ -321,9 +320,9 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
 def _lowest_energy(barrier: float) -> float:
     """Return the smallest eigenvalue nu of -f'' + (x^2/4 - 1/2) f = nu f."""
-    # f is exp(-x^2/4) times the solution of the backward equation, and zero at the barrier and far
-    # below it.  Solved by collocation at Chebyshev points (Trefethen, Spectral Methods in MATLAB,
-    # 2000, program 6).
+    # f is exp(-x^2/4) times the solution of the backward equation; it is zero at the barrier and
+    # far below the barrier.  Collocation at Chebyshev points: Trefethen, Spectral Methods in
+    # MATLAB, 2000, program 6.
     order, length = 64, 14.0
     x = np.cos(math.pi * np.arange(order + 1) / order)
     c = np.ones(order + 1)
@@ -337,7 +336,7 @@ def _lowest_energy(barrier: float) -> float:
 
 
 def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:
-    """Return the zero between two ends to 1e-12, by the Illinois method, without SciPy."""
+    """Return the zero between two ends, to 1e-12, by the Illinois method (without SciPy)."""
     f_low, f_high = f(low, argument), f(high, argument)
     side = 0
     while True:

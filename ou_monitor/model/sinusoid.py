@@ -2,13 +2,14 @@
 Sinusoids in a voltage: fits at given frequencies, and detection of clear tones.
 
 `tones` is for the node, which must not load SciPy; `spectral_lines` detects weaker lines, in
-averaged periodograms.  An ordinate of the periodogram of noise is exponential.  Divided by the
-median of its neighbours, of rank j among N, it exceeds r with probability
-prod_(i=1..j) 1 / (1 + r / (N - i + 1)), because the spacings of ordered exponential variables are
-independent and exponential (Renyi 1953).  So the test needs no model of the spectrum.
+averaged periodograms.  The periodogram ordinates of noise are exponentially distributed.  The
+ratio of an ordinate to the median of its N neighbours (the j-th smallest) exceeds r with
+probability prod_(i=1..j) 1 / (1 + r / (N - i + 1)), because the spacings of ordered exponential
+variables are independent and exponential (Renyi 1953).  So the test needs no model of the
+spectrum.
 
-Limits: as in `spectral_lines`; each piece of a few seconds is tested alone, so tones that are
-visible only in the average over pieces are missed.
+Limits: as in `spectral_lines`.  Each piece of a few seconds is tested separately, so tones that
+are visible only in the average over pieces are missed.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from ou_monitor.records import FloatArray
 
 # Probability of reporting a line, at any load level, in a recording without lines.
 FALSE_ALARM = 0.01
-# Maximum length of a short piece, s: tones of motors and converters drift.
+# Maximum length of a short piece, s, because tones of motors and converters drift.
 SHORT = 4.0
 # Minimum number of periods of a line in a piece: with fewer, slow noise looks like a line, and
-# removing mean and trend removes a part of the line.
+# subtracting mean and trend removes a part of the line.
 FIRST = 10
-# Neighbours of an ordinate: distance of the nearest, in bins, and number.  Only every second
-# ordinate is used, because the window correlates adjacent ones.
+# Neighbours of an ordinate: distance of the nearest, in bins, and their number.  Only every second
+# ordinate is a neighbour, because the window correlates adjacent ordinates.
 GUARD, NEIGHBOURS = 4, 64
 # Maximum factor on the number of neighbours in long pieces, whose bins are narrower.
 _MORE = 4
 # Number of bins on either side over which the window spreads a steady line.
 LOBE = 2
-# Minimum number of samples of a piece, and of ordinates in which lines are searched for.
+# Minimum number of samples in a piece, and of ordinates that are searched.
 FEWEST_SAMPLES, FEWEST_TESTED = 128, 32
 # Parts of a piece whose phases are compared, and frequencies tried for each bin of the piece.
 _PHASES, _TRIED = 64, 32
@@ -83,7 +84,7 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
 
 def without_sinusoids(piece: FloatArray, rate: float, frequencies: Sequence[float],
                       reach: float) -> FloatArray:
-    """Subtract the strongest sinusoid near each frequency, Hz, in turn, from a piece, V."""
+    """Subtract, one after another, the strongest sinusoid near each frequency, Hz (piece in V)."""
     for frequency in frequencies:
         piece = piece - fit_sinusoid(piece, rate, frequency, reach).sampled(
             np.arange(piece.size) / rate)
@@ -97,7 +98,7 @@ def _rotation(turns: float, count: int) -> npt.NDArray[np.complex128]:
 
 
 def local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArray:
-    """Return the upper median of the nearest neighbours of each ordinate, shape of `where`."""
+    """Return the upper median of each ordinate's nearest neighbours; shape of `where`."""
     n = where.size
     # If there are many neighbours, adjacent ordinates share one median.
     hop = max(1, near // NEIGHBOURS)
@@ -154,7 +155,7 @@ def tones(v: FloatArray, white: FloatArray, rate: float, lowest: float = 0.0) ->
 
 
 def neighbours(ordinates: int, share: float = 1.0) -> int:
-    """Return the number of neighbours: even, and spanning the same band in Hz in long pieces."""
-    # share: length of the piece, relative to a short one.
+    """Return the number of neighbours, which is even and grows with the length of the piece."""
+    # share: length of the piece relative to a short one; the neighbours span the same band in Hz.
     there = max(2, (ordinates - 2 * GUARD) // 4 * 2)
     return min(there, NEIGHBOURS * min(_MORE, max(1, int(share))))

@@ -3,22 +3,23 @@ Spectral lines: detection by a test, measurement with errors, and removal.
 
 `analyze` searches each load level, `discover` the scores of a model, `compare` the residuals.
 
-A periodogram ordinate of noise is exponential, and the sum of K ordinates is gamma, whatever the
-distribution of the noise; a line exceeds its neighbours.  The noise at each frequency is estimated
-by the median of neighbouring ordinates, whose distribution is known exactly; so the test needs no
-model of the spectrum, and a second line nearby does not hide the first.  There are two passes: in
-pieces of a few seconds, because tones of motors and converters drift, and in the longest possible
-pieces, where a tone of constant frequency (of a crystal oscillator) is clearest.
+Whatever the distribution of the noise, its periodogram ordinates are exponentially distributed,
+and sums of K ordinates follow a gamma distribution.  A line is an ordinate that exceeds its
+neighbours.  The noise at each frequency is estimated by the median of neighbouring ordinates,
+whose distribution is known exactly; so the test needs no model of the spectrum, and a second line
+nearby does not hide the first.  There are two passes: over pieces of a few seconds, because tones
+of motors and converters drift, and over the longest possible pieces, in which a tone of constant
+frequency (from a crystal oscillator) is clearest.
 
 Each line is subtracted as a sinusoid with its own amplitude, phase and frequency in each piece of
-the length in which it was found; this also removes a little noise.
+the length in which the line was found; this also removes a little noise.
 
-Limits: the noise is treated as constant over the neighbours (about 60 bins either side), and a
-line must also exceed the nearest eight on either side, so that a slope or hump of the noise does
-not count as a line; a narrower resonance does.  Samples are treated as evenly spaced; a line may
-be an alias; frequencies below `FIRST` periods per piece are not searched.  A line whose frequency
-changes is spread over bins, and may be missed.  If a tone moves by more than a bin within a piece,
-or is modulated, its sidebands remain.
+Limits: the noise is treated as constant over the neighbours (about 60 bins on either side).  A
+line must also exceed the nearest eight ordinates on either side, so that a slope or a wide hump of
+the noise does not count as a line; a resonance narrower than these does.  Samples are treated as
+evenly spaced; a line may be an alias; frequencies below `FIRST` periods per piece are not
+searched.  A line whose frequency changes is spread over bins, and may be missed.  If a tone moves
+by more than a bin within a piece, or is modulated, its sidebands remain.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from scipy.optimize import brentq
 from scipy.signal import welch
 from scipy.special import betaincinv, chndtrinc, gammaincc, gammaincinv
 
-# Maximum samples of a long piece (for memory and time).
+# Maximum number of samples in a long piece; limits memory and time.
 _LONGEST = 1 << 20
 # Nodes and weights of quadrature over 0..1.
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
@@ -62,7 +63,7 @@ class Line:
     rms_low: float
     rms_high: float
     share: float  # Share of the variance of the segments in which it is measured
-    p_value: float  # p-value of the ordinate, times the number of ordinates tested at all levels
+    p_value: float  # p-value of its ordinate, times the number of ordinates tested at all levels
 
 
 # Maximum distance of a harmonic from a multiple of the fundamental, in fundamentals, and maximum
@@ -149,9 +150,9 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
                wide: bool = False) -> LineSearch:
     """Search evenly spaced segments, V, for lines (rate and lowest in Hz); strongest first."""
     # levels: number of load levels searched, which share false_alarm.
-    # white: innovations of `parts` (if they are not white), in which lines are detected.
+    # white: innovations of `parts`, in which lines are detected if `parts` are not white noise.
     # wide: whether a line may be as wide as a hump of the noise.
-    # The mean is removed first, because detrending a large constant leaves rounding errors.
+    # Subtract the mean first, because detrending a large constant leaves rounding errors.
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))
     sizes = [part.size for part in parts]
@@ -168,8 +169,8 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     for length, where in tested.items():
         lines, least = _search(parts, white, rate, length, where,
                                false_alarm / (levels * count), wide)
-        # A line found in both passes is measured in short pieces, because it may drift, unless
-        # only the long pieces show it clearly.
+        # A line found in both passes is measured in the short pieces, because it may drift, unless
+        # it is significant only in the long pieces.
         for line in lines:
             same = [other for other in found if abs(line.frequency - other.frequency)
                     < 2 * LOBE * other.resolution]
@@ -198,7 +199,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
     if not wide:
-        # A hump, unlike a comb, has many high ordinates side by side: multiply p by their number.
+        # A hump consists of many adjacent high ordinates: multiply p by their number.
         count = np.searchsorted(hits, hits + NEIGHBOURS) - np.searchsorted(hits, hits - NEIGHBOURS)
         hits = hits[_beside(white, where[hits], k) * count < _UNLIKE]
     p = np.ones(where.size)
@@ -206,7 +207,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
-    # Only segments in which lines are measured count, because shorter ones may be quieter.
+    # Use only the segments in which lines are measured, because shorter ones may be quieter.
     held = [part for part in parts if part.size >= length]
     total = float(sum(part @ part for part in held) / sum(part.size for part in held))
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)

@@ -22,9 +22,9 @@ from ou_monitor.records import FloatArray
 # of all terms in the processor's caches.
 SEGMENT = 15_000
 
-# Size of an array that is allocated and freed once.  The GNU allocator then keeps freed memory for
-# reuse.  Otherwise each segment would request its memory anew from the system, page by page, which
-# can take longer than the arithmetic.
+# Size of an array that is allocated and freed once, after which the GNU allocator keeps freed
+# memory for reuse.  Otherwise each segment would request its memory from the system page by page,
+# which can take longer than the arithmetic.
 _KEPT = 2**18
 
 # Relative difference below which steps count as equal, because stamps are rounded.
@@ -58,8 +58,8 @@ class SupplyModel:
     load: LoadStart | None = None
     # Date in the model file on which the model was learned; empty: unknown.
     date: str = field(default='', compare=False)
-    # Current at which the load is 1, A, negative where the sensor counts so; 0: the load is
-    # throttle, 0..1.
+    # Current at which the load is 1, A (negative if the sensor's current is negative); 0: the load
+    # is throttle, 0..1.
     full_current: float = 0.0
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ class SupplyModel:
 
     @property
     def charged(self) -> bool:
-        """Return whether its charge is known: the entry `load` is for throttle."""
+        """Return whether the charge is known: there is an entry `load`, and it is for throttle."""
         return self.load is not None and not self.full_current
 
     @property
@@ -102,7 +102,8 @@ class SupplyModel:
         """
         Draw a recording, V (t in s, rising).
 
-        throttle: 0..1, shape (n,), each for the time since the previous stamp; or one number.
+        throttle: 0..1, shape (n,), each value for the time since the previous stamp; or one
+        number.
         """
         stamps = np.asarray(t, dtype=np.float64)
         load = None if throttle is None else np.broadcast_to(
@@ -140,10 +141,11 @@ class Simulation:
     """
     A simulation that continues from segment to segment; each term has its own generator.
 
-    The same seed gives the same samples, except for rounding, for any division into segments.
-    `resistance` multiplies the response to throttle, for an old pack, and may change between
-    segments.  With `charge`, 0..1 at the first sample, the level falls as throttle discharges the
-    pack (`model.load`), not by the `drift` term; NaN: the charge that matches the model's level.
+    Except for rounding, a seed gives the same samples for any division into segments.
+    `resistance` multiplies the response to throttle (above 1: an old pack), and may change between
+    segments.  With `charge` (0..1, at the first sample), the level falls as throttle discharges
+    the pack (`model.load`), which replaces the `drift` term; NaN: the charge that matches the
+    model's level.
     """
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator, *,
@@ -187,8 +189,8 @@ class Simulation:
 
     def _in_order(self, rng: np.random.Generator) -> list[Effect]:
         """Return the effects of all terms in the order of their stages."""
-        # The draws of a term depend on its name and its index among terms of that name, so
-        # another term does not change them.
+        # The draws of a term depend only on the seed, its name and its index among terms of that
+        # name, so adding other terms does not change them.
         seeds = rng.integers(0, 2**63, size=2).tolist()
         counts: dict[str, int] = {}
         pairs: list[tuple[Stage, Effect]] = []

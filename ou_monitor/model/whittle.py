@@ -1,11 +1,11 @@
 """
-Whittle likelihood: spectra are fitted to a periodogram, in milliseconds for a whole recording.
+Whittle likelihood: fits spectra to a periodogram, in milliseconds for a whole recording.
 
-The ordinates of a long series are nearly independent exponential variables whose means are the
-spectrum (Whittle, Ark. Mat. 2 (1953) 423); averaged in bins they are gamma.  `Ordinates` is for
-the scores of a model.  `CrossSpectrum` is for a voltage with regressors, and uses the ordinates
-expected for the length of the window (debiased Whittle likelihood: Sykulski et al., Biometrika 106
-(2019) 251).
+The periodogram ordinates of a long series are nearly independent exponential variables, whose
+means are the spectrum (Whittle, Ark. Mat. 2 (1953) 423); means over bins follow gamma
+distributions.  `Ordinates` is for the scores of a model.  `CrossSpectrum` is for a voltage with
+regressors, and uses the expected ordinates for the length of the window (debiased Whittle
+likelihood: Sykulski et al., Biometrika 106 (2019) 251).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from ou_monitor.records import FloatArray
 
 # Number of ordinates at low frequencies that are not binned, and bins per octave above them.
 _SINGLE, _TO_OCTAVE = 16, 10
-# Scores beyond this are outliers, and clipped.
+# Limit at which scores are clipped.
 _FAR = 5.0
-# Rounds of scoring, step of the numerical derivatives, convergence tolerance, nats, and maximum
-# step of a coordinate.
+# Maximum number of rounds of scoring; step of the numerical derivatives; convergence tolerance,
+# nats; maximum step of a coordinate.
 _ROUNDS, _STEP, _SETTLED, _MOST = 25, 1e-3, 0.01, 1.0
 # Initial and maximum damping of a step.
 _DAMPED, _STUCK = 1e-3, 1e4
@@ -117,14 +117,15 @@ class CrossSpectrum:
 
     def __init__(self, rows: FloatArray, lengths: Sequence[int],
                  absorbed: FloatArray | None = None) -> None:
-        # The cosine transform continues the window as its mirror image; so different values at
-        # the ends cause no leakage, unlike in a Fourier transform.
-        # rows: regressors, and the voltage as the last row, shape (q, n), in stretches of evenly
-        # spaced readings; without regressors (q = 1) each stretch has its own mean.
-        # absorbed: result of `absorbed_by` for an earlier regression, per reading.
+        # The cosine transform continues the window as its mirror image.  So, unlike in a Fourier
+        # transform, different values at the two ends cause no leakage.
+        # rows: regressors, then the voltage, shape (q, n), in stretches of evenly spaced readings;
+        # without regressors (q = 1), each stretch has its own mean.
+        # absorbed: result of `absorbed_by` for an earlier regression, divided by the number of
+        # readings.
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
-        # Lost messages may cause hundreds of stretches; stretches of similar length share bins.
+        # Lost messages may cause hundreds of stretches, so stretches of similar length share bins.
         groups: dict[int, list[FloatArray]] = {}
         for part in np.split(rows, np.cumsum(lengths)[:-1], axis=1):
             groups.setdefault(round(math.log(part.shape[1]) / _WIDTH), []).append(part)
@@ -163,7 +164,8 @@ class CrossSpectrum:
         self._cross = (cross + np.triu(cross, 1).transpose(0, 2, 1)).reshape(-1, q * q)
         self._q, self._n = q, np.concatenate(sizes)
         self._count, place, sign, gone = np.concatenate(places, axis=1)
-        # Ordinates not absorbed: at least a tenth, because the absorbed share is only a mean.
+        # Number of ordinates not absorbed; at least a tenth, because the absorbed number is only
+        # an average.
         self._left = self._count - np.minimum(gone, 0.9 * self._count)
         self._effective = self.free - float(np.sum(self._count - self._left))
         omega = np.pi * place / np.maximum(self._count, 1e-9)
@@ -191,10 +193,10 @@ class CrossSpectrum:
     def cost(self, S: FloatArray, used: int | None = None
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return minus the restricted log-likelihood of spectra, shape (k, bins), and more."""
-        # It is profiled over a factor on each spectrum, which is the second result.  The third is
+        # Results: the cost, minimised over a factor on each spectrum, shape (k,); these factors;
         # the products x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
-        # Keep it definite despite rounding.
+        # Keep the matrices positive definite despite rounding.
         gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10
         free, own = self.free, gram
         if used is not None and used < self._q - 1:

@@ -14,7 +14,7 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
-# Minimum relative difference of two rates, because the formulas below divide by it.
+# Minimum relative difference of two rates, because the formulas below divide by the difference.
 _APART = 1e-4
 
 
@@ -38,7 +38,7 @@ class ACCoupling(Term):
     SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
     STATES: ClassVar[int] = 1
     SEVERAL: ClassVar[bool] = True
-    # An instrument may have two corners; one alone leaves a part.
+    # An instrument may have two corners; one term alone leaves a part of the effect.
     MAY_LEAVE: ClassVar[float] = 0.75
     MEANING: ClassVar[str] = (
         'The instrument is AC-coupled: the relaxation comes from its high-pass.')
@@ -91,7 +91,7 @@ class ACCoupling(Term):
         return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
 
     def beside(self, ou: Term) -> Term:
-        """Return a slow `ou`, because the fitted relaxation may be the instrument's."""
+        """Return a slow `ou`, because the relaxation fitted so far may be the instrument's."""
         return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
     def pass_through(self, columns: FloatArray, s: Segment) -> FloatArray:
@@ -108,7 +108,8 @@ class ACCoupling(Term):
 def bridge(alpha: FloatArray, rate: float, step: FloatArray
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return start, end and spread of one step of a low-passed OU, given the OU at both ends."""
-    # l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z, z normal.
+    # l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z, with l the
+    # low-passed x, and z normal.
     a = np.where(np.abs(alpha / rate - 1.0) < _APART, rate * (1.0 + _APART), alpha)
     share = rate / (rate - a)
     xx = -np.expm1(-2.0 * a * step) / (2.0 * a)

@@ -1,8 +1,8 @@
 """
-All terms: the classes with a NAME in a module of this folder, and causes of other packages.
+All terms: the classes with a NAME in the modules of this folder, and causes of other packages.
 
-Model files and findings use the same names.  Another package declares its causes as entry points
-of the group `ou_monitor.causes`.  If a cause cannot be used, the reason is reported, and
+Model files and findings use these names.  Other packages declare their causes as entry points of
+the group `ou_monitor.causes`.  If such a cause cannot be used, the reason is reported, and
 `discover` continues without the cause.
 """
 
@@ -22,9 +22,9 @@ from ou_monitor.model.terms.term import Term
 from ou_monitor.text import printable
 
 GROUP = 'ou_monitor.causes'
-# Longest reason that is shown, characters.
+# Maximum length of a sentence on a cause that was left out, characters.
 _LONGEST = 200
-# Causes of other packages that failed -> why, one sentence each.
+# For each cause of another package that failed, by name: the reason, a sentence.
 _left_out: dict[str, str] = {}
 
 
@@ -45,7 +45,7 @@ def catalogue() -> Mapping[str, type[Term]]:
         try:
             kind = entry.load()
             _check(kind, entry.name, found)
-        # No error in another package may end a command.
+        # An error in another package must not end the command.
         except (Exception, SystemExit) as error:
             _leave_out(entry.name, error)
         else:

@@ -1,4 +1,4 @@
-"""Data (`View`) to which laws, i.e. distributions of innovations, are fitted; common functions."""
+"""The data (`View`) to which laws of the innovations are fitted, and functions shared by laws."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from scipy.special import ndtr, ndtri
 
 LOG_2PI = math.log(2.0 * math.pi)
-# Minimum probability, which limits scores to about 8.
+# Minimum probability, which limits normal scores to about 8.
 _EDGE = 1e-15
 
 
@@ -33,7 +33,7 @@ class View:
     train: slice  # Samples to which parameters are fitted
     # Gain of the filter, 0..1: 1 without white noise; shape (n,).
     trust: FloatArray | float = 1.0
-    # Share of each variance that comes from the noise of the `ou` in the step before: 1 without
+    # Share of each variance that is due to the noise of the `ou` in the step before: 1 without
     # white noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
     slope: FloatArray | float = 0.0  # Slope of the lines of the model, V/s; shape (n,)
@@ -76,7 +76,7 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
 
 
 def _around(size: int, step: float) -> FloatArray:
-    """Return moves that determine a parabola: none, along each axis, along each pair of axes."""
+    """Return moves that determine a parabola: none, along each axis, and along pairs of axes."""
     moves, pairs = step * np.eye(size), np.triu_indices(size, 1)
     both = moves[pairs[0]] + moves[pairs[1]]
     # Central differences, because one-sided ones are biased by the third derivative.
@@ -97,7 +97,7 @@ def _parabola(found: FloatArray, size: int, step: float) -> tuple[FloatArray, Fl
 def _errors(bend: FloatArray) -> FloatArray:
     """Return joint standard errors from second derivatives of a log-likelihood."""
     errors, slope = np.full(bend.shape[0], math.nan), bend.diagonal()
-    # A parameter that changes nothing, or lies at a limit, does not affect the others' errors.
+    # Leave out parameters without effect or at a limit: they must not affect the others' errors.
     kept = np.flatnonzero(np.isfinite(slope) & (slope < 0.0))
     scale = np.sqrt(-slope[kept])
     curve, axes = np.linalg.eigh(-bend[np.ix_(kept, kept)] / np.outer(scale, scale))
@@ -119,7 +119,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         curve, axes = np.linalg.eigh(bend)
         if curve[0] >= 0.0:
             return None
-        # Step uphill along each principal axis, even if the curvature there is positive.
+        # Step uphill along each principal axis, even where the curvature is positive.
         by = axes @ (axes.T @ gradient / np.maximum(np.abs(curve), _STRAIGHT * -curve[0]))
         gain = 0.5 * float(by @ gradient)
         ends = x + np.clip(by, -0.5, 0.5) * _SHARES[:, None]

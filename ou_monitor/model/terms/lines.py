@@ -1,4 +1,4 @@
-"""Common functions of the terms for lines: states, and detection of broad and moving lines."""
+"""Functions shared by the terms for lines: states, and detection of broad and moving lines."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ def phase_noise(linewidth: float, rng: np.random.Generator
 
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
              lag: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return two states that rotate, decay and are driven by noise, as `Term.block` (1/s, V)."""
-    # Autocovariance of the first: std^2 exp(-damping t) (cos a + lag sin a), a: angle in time t.
+    """Return f, q and h (see `Term.block`) of two states that rotate, decay and are driven."""
+    # turn: angle in each step, rad; damping in 1/s; std in V.  Autocovariance of the first state:
+    # std^2 exp(-damping t) (cos a + lag sin a), with a the angle in time t.
     shrink = np.exp(-damping * step)
     f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
     along, across = shrink * np.cos(turn), shrink * np.sin(turn)
@@ -54,19 +55,19 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     return f, q, np.array([1.0, 0.0])
 
 
-# Segments per 1 / linewidth, and minimum number of segments.
+# `power_spread`: number of segments per 1 / linewidth, and minimum number of segments.
 _FINE, _ENOUGH = 4.0, 12
-# Maximum `power_spread` of a line of constant amplitude, and minimum of ringing; from 0.7 to 0.85,
-# evidence decides.  In simulations with outliers and 14 segments, all 60 lines, but also 10 of 60
-# ringings were below CONSTANT, and 54 ringings, but also 2 lines above RINGING (with 33 segments:
-# 60 lines and 2 ringings, 60 ringings and no line).
+# Maximum `power_spread` of a line of constant amplitude, and minimum of ringing; between 0.7 and
+# 0.85 the evidence decides.  In 60 simulated lines and 60 simulated ringings, with outliers: 60
+# lines and 10 ringings were below CONSTANT, 2 lines and 54 ringings above RINGING, if there were
+# 14 segments; with 33 segments, 60 and 2 were below, 0 and 60 above.
 CONSTANT, RINGING = 0.85, 0.7
 
 
 def power_spread(view: View, frequency: float, linewidth: float) -> float:
     """Return interquartile range / median of a line's powers in segments (arguments in Hz)."""
     # 0 for a line of constant amplitude; ln 3 / ln 2 = 1.58 for ringing driven by noise, whose
-    # powers are exponential; NaN with too few segments.  Outliers hardly affect it.
+    # powers are exponentially distributed; NaN with too few segments.  Outliers hardly matter.
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual, view.at
     count = v.size // max(length, 1)
@@ -79,7 +80,8 @@ def power_spread(view: View, frequency: float, linewidth: float) -> float:
 
 
 def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> float:
-    """Return a peak's excess over both its sides, in standard errors; -inf without a side (Hz)."""
+    """Return a peak's excess over both sides, in standard errors; -inf if a side is missing."""
+    # rate, frequency and width in Hz.
     power = np.abs(np.fft.rfft(z - z.mean()))[1:] ** 2
     away = (np.fft.rfftfreq(z.size, 1.0 / rate)[1:] - frequency) / width
     inside = power[np.abs(away) <= 0.5]
@@ -101,7 +103,7 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
         # The lowest bins contain slow noise, not ringing.
         density[:3] = 0.0
         at = int(np.argmax(density))
-        # Tail of a mean of exponentials (Cramer bound), over the number of bins searched.
+        # Cramer bound of the tail of a mean of exponentials, against the number of bins searched.
         mean, segments = float(density[at] / np.median(density[3:])), z.size / length
         if segments * (mean - 1.0 - math.log(max(mean, 1e-9))) > math.log(density.size):
             found.append((float(frequency[at]), 4.0 * math.pi * rate / length))
@@ -131,12 +133,12 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     return top, trials
 
 
-# Share of independent lines among the lines examined, because neighbours share most bins.  With
-# it, 1 of 120 simulated flights of white noise exceeded the 95 % point.
+# Share of the examined lines that are independent, because neighbours share most bins.  With this
+# share, 1 of 120 simulated flights of white noise exceeded the 95 % point.
 _INDEPENDENT = 0.02
 # Maximum slope, in sampling rates: from idle to full throttle a line may fold once and return.
 _REACH = 1.0
-# Ratio of the long segments to the short ones, which show lines while throttle moves fast.
+# Length of the long segments over the short ones, which show lines while throttle moves fast.
 _SHORTER = 8
 
 

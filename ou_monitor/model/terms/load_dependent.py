@@ -18,7 +18,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class LoadDependentSigma(Term):
-    """Multiply sigma by a factor whose ln is linear between knots, constant beyond."""
+    """Multiply sigma by a factor; its ln is linear between knots, and constant beyond them."""
 
     NAME: ClassVar[str] = 'load_dependent_sigma'
     FAMILY: ClassVar[str] = 'intensity'
@@ -98,22 +98,24 @@ class LoadDependentSigma(Term):
                 for _, knots, factors in forms[:2]]
 
 
-# Penalty of the search for the position of a step, nats: ln of the number of positions tried.
+# Penalty of the search for the position of a step, nats: ln of the number of positions tried (91).
 _STEP_COST = 4.5
-# Penalty of the search for a knot, nats; number of bins, minimum scores in a bin, maximum knots.
+# Penalty of the search for a knot, nats; number of bins; minimum number of scores in a bin;
+# maximum number of knots.
 _KNOT_COST = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
-# Maximum logarithm of a factor; nothing else limits it where white noise hides the rail.
+# Maximum |ln factor|: where white noise hides the rail, the data do not limit the factor.
 _MOST = 4.0
-# Minimum distance of knots, and half the width of a step, in throttle.
+# Minimum distance between knots, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 
 
 def _ends(throttle: FloatArray) -> FloatArray:
-    """Return lowest and highest throttle, held-out part included, as knots of a straight line."""
+    """Return lowest and highest throttle of all samples, as the knots of a straight line."""
     return np.array([throttle.min(), throttle.max()])
 
 
+# Result of `_binned`.
 Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
@@ -125,13 +127,14 @@ def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
     some = count >= _IN_BIN
     centre = np.bincount(where, x, last + 1)[some] / count[some]
     power = np.bincount(where, square, last + 1)[some] / count[some]
-    # Squares less a known variance may be negative; then the least power is one standard error.
+    # Mean squares from which a known variance was subtracted may be negative: use at least one
+    # standard error.
     least = np.sqrt(np.bincount(where, square * square, last + 1)[some]) / count[some]
     return centre, 0.5 * np.log(np.maximum(np.maximum(power, least), 1e-12)), count[some]
 
 
 def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
-    """Return weights (sets, inputs, knots) that interpolate at x between knots (sets, knots)."""
+    """Return weights, shape (sets, inputs, knots), that interpolate at x; knots: (sets, knots)."""
     sets, count = knots.shape
     at = np.clip((x[None, :, None] >= knots[:, None, :]).sum(axis=2) - 1, 0, count - 2)
     rows = np.arange(sets)[:, None]
@@ -145,7 +148,7 @@ def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
 
 
 def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return for each set of knots the log factors fitted to the bins, and the misfit, nats."""
+    """Fit log factors to the bins for each set of knots; return them and the misfits, nats."""
     centre, log, count = bins
     # The logarithm of a standard deviation estimated from n scores has a variance of 1/(2 n).
     weight = 2.0 * count
@@ -159,7 +162,7 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _greedy(bins: Bins, knots: FloatArray, penalty: float, apart: float
             ) -> tuple[FloatArray, FloatArray, float]:
-    """Add the best knot while it gains `penalty`; return knots, log factors and misfit, nats."""
+    """Add the best knot while that gains `penalty`; return knots, log factors and misfit, nats."""
     factors, misfit = _to_bins(bins, knots[None])
     found = knots, factors[0], float(misfit[0])
     while found[0].size < _MOST_KNOTS:
@@ -213,30 +216,31 @@ class LoadDependentAlpha(Term):
         return () if view.throttle is None else (cls(0.0),)
 
 
-# Spans of the moving means of throttle from which changes are measured, s.
+# Time constants of the moving means of throttle from which changes are measured, s.
 _FAST, _SLOW = 0.03, 0.2
-# Inputs on which the noise may depend, and their time constants, s: throttle; its distance from
-# its mean over the last 30 ms; its change between samples; the distance between its means over the
-# last 30 and 200 ms; and decaying sums of its rises and of its falls.
+# Inputs on which the noise may depend, and their time constants, s: throttle; the distance of
+# throttle from its mean over the last 30 ms; its change between samples; the distance between its
+# means over the last 30 and 200 ms; and decaying sums of its rises and of its falls.
 INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
 # Penalty of choosing an input, nats: ln of the number of inputs.
 _INPUT_COST = math.log(len(INPUTS))
-# Minimum share of white noise in the one-step errors; with less, it cannot be separated.
+# Minimum share of white noise in the one-step errors for separating it from the rail's noise.
 _LEAST_WHITE = 0.05
-# Quantiles at the edges of an input's bins, dense at the top because most changes are zero.
+# Quantiles at the edges of an input's bins; dense at the top, because most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
 # Maximum squared score once the curves are roughly known, to limit the effect of outliers.
 _LARGEST = 25.0
-# Rounds of fitting each curve given the others; minimum distance of knots relative to the range.
+# Number of rounds in which each curve is fitted given the others; minimum distance between knots
+# relative to the range of the input.
 _ROUNDS, _SPACING = 2, 0.02
-# Index of the curve that is applied to the sum of the others.
+# Index of the curve that is applied to the sum of the other curves.
 SUM = len(INPUTS)
 
 
 def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
            ) -> tuple[FloatArray, FloatArray] | None:
-    """Return knots in x, and ln of the scores' std relative to the first; None if constant."""
+    """Return knots in x, and ln of the scores' std, 0 at the first knot; None if constant."""
     # square: squared scores, shape (n,); shares: quantiles at the edges of the bins of x; log: a
     # rough estimate of ln of the scores' std, shape (n,), if available.
     edges = np.unique(np.quantile(x, shares))
@@ -268,8 +272,8 @@ class LoadDependentNoise(Term):
     Multiply the white noise by a factor that depends on throttle and its changes.
 
     The logarithm of the factor is a sum of curves over some of `INPUTS`, linear between knots and
-    constant beyond them; a last curve may be applied to the sum.  A power of the factor may
-    multiply sigma too, if the load disturbs the rail itself.
+    constant beyond them; a last curve may be applied to the sum.  If the load disturbs the rail
+    itself, sigma is multiplied by a power of the factor.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -318,7 +322,7 @@ class LoadDependentNoise(Term):
                 for k in np.unique(numbers).tolist()}
 
     def factors(self) -> dict[str, tuple[list[float], list[float]]]:
-        """Return knots and factors by input; `product`: a curve over the product of the others."""
+        """Return knots and factors by input; `product`: the product of the other factors."""
         names = [f'{what} {span:g} s' if span else what for what, span in INPUTS]
         return {(*names, 'product')[k]: (
             (np.exp(at) if k == SUM else at).tolist(), np.exp(log).tolist())
@@ -351,22 +355,22 @@ class LoadDependentNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return curves fitted to squares of the scores, without and with a factor on sigma."""
+        """Return curves fitted to the squared scores, without and with a factor on sigma."""
         if view.throttle is None:
             return []
         white = cls((), (), ()).apart(view)
         return [white, replace(white, on_sigma=0.5)] if white.at else [white]
 
     def apart(self, view: View) -> LoadDependentNoise:
-        """Return curves of white noise alone, refitted to the scores of a model with this term."""
+        """Return the curves, for white noise only, refitted to the scores of a model with them."""
         assert view.throttle is not None
         inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
             view.step, view.throttle).items()}
         square = view.z[view.train] ** 2
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
-            # Subtract the part of the rail's own noise, which the term does not scale.
-            # Negative squares are kept: without them, low noise would be overestimated.
+            # Subtract the share of the rail's noise, which the term does not scale.  Keep negative
+            # results, because without them low noise would be overestimated.
             square = (square - (1.0 - white)) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))
@@ -395,7 +399,7 @@ class LoadDependentNoise(Term):
 
 
 class Inputs:
-    """Computes some of INPUTS; keeps its state from segment to segment."""
+    """Computes some of INPUTS, with a state that is kept from segment to segment."""
 
     def __init__(self, wanted: Iterable[int]) -> None:
         self._wanted = [k for k in wanted if k != SUM]

@@ -15,8 +15,9 @@ from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, 
 from ou_monitor.records import FloatArray
 
 
-# Evidence required for a growth in addition to the penalty of its parameter, nats: as for a cause.
-# Without it, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
+# Evidence required for a growth in addition to the penalty of its parameter, nats (as much as for
+# a cause).  Without this requirement, a growth was found in 5 of 72 simulated flights with a
+# steady sag; with it, in none.
 _GROWS = 6.0
 
 
@@ -25,8 +26,8 @@ class LoadSag(Term):
     """
     Subtract (linear + growth * t) * throttle + square * throttle^2 from the level.
 
-    t is the time since the first sample: the resistance of a pack rises as it empties, and falls
-    as it warms.  A square or growth of exactly 0 is not fitted.
+    t is the time since the first sample.  The growth describes a pack whose resistance rises as it
+    empties, and falls as it warms.  A square or growth of exactly 0 is not fitted.
     """
 
     NAME: ClassVar[str] = 'load_sag'
@@ -66,8 +67,9 @@ class LoadSag(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a straight line, a parabola, and one that grows."""
-        # No growth with a straight line: a slow transient would then be added for the curvature.
+        """Return a straight line, a parabola, and a parabola that grows."""
+        # A straight line is not combined with growth, because the search would then add a slow
+        # transient for the curvature.
         return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO), cls(0.0, NEXT_TO_ZERO, NEXT_TO_ZERO)
 
 
@@ -80,10 +82,11 @@ class LoadTransient(Term):
     """
     Add gain * d(u) + square * d(u^2) + rise * max(d(u), 0), with d(x) = x - low-pass of x (tau).
 
-    u is the delayed throttle.  Without square, a unit step up adds (gain + rise) * exp(-t/tau), a
-    unit step down -gain * exp(-t/tau): motors draw more current while they speed up, but return no
-    current while they slow down.  gain > 0 delays the sag (if gain and square equal the sag's
-    linear and square, the result is a low-pass); gain < 0 deepens the sag at first (inrush).
+    u is the delayed throttle.  Without `square`, a unit step up adds (gain + rise) * exp(-t/tau),
+    and a unit step down adds -gain * exp(-t/tau): motors draw more current while they speed up,
+    but return no current while they slow down.  gain > 0 delays the sag (if gain and square equal
+    the sag's linear and square, the sag is low-passed); gain < 0 deepens the sag at first
+    (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'
@@ -136,7 +139,7 @@ class LoadTransient(Term):
                 # Use the throttle `delay` ago; at the beginning, the first throttle.
                 times = np.concatenate((times, s.at))
                 values = np.concatenate((values, throttle))
-                # Rounding matters where the delay is a whole number of steps.
+                # Tolerance for rounding, in case the delay is a whole number of steps.
                 rounding = _ROUNDING + 2.0 * np.spacing(np.abs(s.at))
                 then = np.searchsorted(times, s.at - self.delay + rounding, side='right') - 1
                 throttle = values[np.maximum(then, 0)]
@@ -168,28 +171,29 @@ class LoadTransient(Term):
         count = max(2, math.ceil(2.0 * math.log2(longest / (SHORTEST * step))))
         lags = [cls(0.0, float(tau), 0.0) for tau in np.geomspace(
             SHORTEST * step, longest, count)]
-        # A pure delay of whole steps: a response that never decays.
+        # A pure delay, of whole steps, is a response that never decays.
         latest = max(_LATEST, 4.0 * step)
         delays = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
         late = [cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in delays]
         return tuple(form for term in (*lags, *late) for form in term.forms())
 
     def forms(self) -> tuple[LoadTransient, ...]:
-        """Return variants to fit: linear, with a square, and with an inrush if fast enough."""
+        """Return variants to fit: linear, with a square, and with a rise if fast enough."""
         plain = replace(self, rise=0.0, square=0.0)
         inrush = self.tau < _INRUSH and not self.delay
         return (plain, replace(plain, square=NEXT_TO_ZERO),
                 *([replace(plain, rise=NEXT_TO_ZERO)] if inrush else []))
 
 
-# Shortest visible time constant, in steps: one seventh of the response remains at the next sample.
+# Shortest visible time constant, in steps: a seventh of the response remains at the next sample.
 SHORTEST = 0.5
-# Longest time constant, in durations of the recording: a slower response looks like a drift
+# Longest time constant, as a share of the recording, because a slower response looks like a drift
 # (with 0.25, held-out scores of ar8, jd and cf_takeoff were lower).
 LONGEST = 0.125
 # Longest time that motors take to speed up, s.
 _INRUSH = 0.2
-# Meaning and remedy by (slower than motors, delays the fall instead of deepening it).
+# Meaning and remedy; keys: whether the response is slower than the motors, and whether it delays
+# the fall rather than deepening it.
 _ABOUT = {
     (False, True): ('Part of the fall lags behind throttle: motors and filters respond late.',
                     'Expect a smaller fall in short bursts of throttle.'),
@@ -202,7 +206,7 @@ _ABOUT = {
     (True, False): ('Part of the fall after a rise of throttle recovers while throttle is held: a '
                     'regulator corrects it, or a battery warms.',
                     LoadTransient.REMEDY)}
-# Number of delays to try, and the longest, s.
+# Number of delays to try, and the longest delay, s.
 _DELAYS, _LATEST = 12, 0.1
 # Time constant, in durations of the recording, for a response that never decays.
 _LASTING = 100.0

@@ -1,4 +1,4 @@
-"""A restoring force that is not linear: constant-power load, softening near brown-out."""
+"""A nonlinear restoring force, due to a constant-power load or softening near brown-out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class NonlinearRestoring(Term):
-    """Add square * x^2 + cube * x^3 to the force alpha x; a square needs a cube."""
+    """Add square * x^2 + cube * x^3 to the force alpha x; a square requires a cube above 0."""
 
     NAME: ClassVar[str] = 'nonlinear_restoring'
     FAMILY: ClassVar[str] = 'restoring'
@@ -86,8 +86,8 @@ class NonlinearRestoring(Term):
             return scores, log_normal(scores) - 0.5 * np.log(spread)
 
         level = [0.0, 1.0]
-        # Start from a regression, which holds the force constant within each step.  Overflows are
-        # harmless: they come from bad coefficients, or a stuck sensor.
+        # Start from a regression that treats the force as constant within each step.  Overflows
+        # are harmless: they come from bad coefficients or a stuck sensor.
         with np.errstate(over='ignore', invalid='ignore'):
             b = _maximise(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
                           error)
@@ -103,7 +103,7 @@ class NonlinearRestoring(Term):
         if cube < 0.0:
             # The voltage would diverge.
             return None
-        # The cube must be large enough for a stable voltage in spite of the square.
+        # Raise the cube until the voltage is stable in spite of the square.
         cube = max(cube, _HOLDS * square * square / alpha)
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,
@@ -113,9 +113,9 @@ class NonlinearRestoring(Term):
 def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
                 variance: float) -> tuple[FloatArray, FloatArray]:
     """Return the mean change of x in each step, V, and its variance relative to `variance`."""
-    # In each part of the step, the force is linearised about the deviation at its beginning, with
-    # the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).  Beyond
-    # the extremum of a softening force, the force stays constant.
+    # In each part of the step, the force is linearised about the deviation at the beginning of the
+    # part, and the mean effect of the curvature is added (Shoji & Ozaki, Stoch. Anal. Appl. 16
+    # (1998) 733).  Beyond the extremum of a softening force, the force is taken as constant.
     tops = np.roots([3.0 * cube, 2.0 * square, linear])
     tops = tops[np.isreal(tops)].real
     low = np.max(tops, initial=-np.inf, where=tops < 0.0)
@@ -161,12 +161,12 @@ def _maximise(density: Callable[[FloatArray], FloatArray], b: FloatArray, error:
     return b
 
 
-# Minimum cube, in square^2/alpha: above 1/4, the force has only one zero.
+# Minimum cube, in square^2/alpha (above 1/4 the force has only one zero).
 _HOLDS = 0.26
-# Slope of the force times the step: maximum, minimum, and value above which the step is split;
-# maximum number of parts.
+# Slope of the force times the step: maximum, minimum, and maximum in one part of a step; maximum
+# number of parts.
 _STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
-# Maximum rounds of scoring, and minimum gain of a round to start another, nats.
+# Maximum number of rounds of scoring, and minimum gain of a round to start another, nats.
 _ROUNDS, _SETTLED = 5, 0.05
 # Step of the numerical derivatives, in standard errors.
 _NEAR = 0.1

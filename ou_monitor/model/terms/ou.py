@@ -13,9 +13,9 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Term
 from ou_monitor.records import FloatArray
 
-# With a nonlinear force, steps are split into parts: their maximum length, in relaxation times of
-# the whole force at one standard deviation (the error in law is of second order in it), and their
-# maximum number.
+# With a nonlinear force, steps are split into parts.  Maximum length of a part, in relaxation
+# times of the total force at one standard deviation (the error in law is of second order in this
+# length), and maximum number of parts.
 _PART = 0.05
 _PARTS_MOST = 1_000_000
 # Maximum number of parts whose random numbers are stored at once.
@@ -77,7 +77,7 @@ def _transition(s: Segment) -> tuple[FloatArray, FloatArray]:
 
 
 def _extended(n: int, values: FloatArray) -> FloatArray:
-    """Return n values: the given ones, and then the last one repeated."""
+    """Return n values: the given ones, then repeats of the last one."""
     if values.size == n:
         return values
     filled = np.full(n, values[-1])
@@ -87,7 +87,7 @@ def _extended(n: int, values: FloatArray) -> FloatArray:
 
 def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator
                ) -> FloatArray:
-    """Return the state under a nonlinear force; rng gives the draws of split steps."""
+    """Return the state under a nonlinear force; `rng` draws for the parts of split steps."""
     square, cube = s.bend
     # After 20 relaxation times, the law is stationary; the first step may be infinite.
     span = np.minimum(s.step, 20.0 / s.alpha)
@@ -100,7 +100,7 @@ def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Gene
     phi = np.exp(-s.alpha * h)
     spread = s.sigma * np.sqrt(-np.expm1(-2.0 * s.alpha * h) / (2.0 * s.alpha) * s.power)
     x = np.empty(s.t.size)
-    # Bundles of samples limit the memory; they do not change the order of the draws.
+    # Bundles of samples limit memory, and do not change the order of the draws.
     for some in _bundles(parts):
         cut = parts[some]
         draws = np.empty(int(cut.sum()))
@@ -114,8 +114,8 @@ def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Gene
                                         s.push[some].tolist(), strict=True):
             by_square, by_cube = 0.5 * step * square, step * cube
             for _ in range(count):
-                # Half a part of -cube x^3 (its exact flow) and of -square x^2 (midpoint
-                # rule), the exact law of the linear force, and back: symmetric, of order 2.
+                # Half a part of -cube x^3 (exact flow) and of -square x^2 (midpoint rule), then
+                # the exact law of the linear force, then both halves in reverse order.
                 before /= math.sqrt(1.0 + by_cube * before * before)
                 middle = before - 0.5 * by_square * before * before
                 before -= by_square * middle * middle
@@ -145,7 +145,7 @@ def _stiffness(s: Segment) -> FloatArray:
     square, cube = s.bend
     var = s.sigma * s.sigma / (2.0 * s.alpha)
     if cube > 0.0:
-        # With only a cubic force the variance is 0.48 sigma / sqrt(cube).
+        # With a purely cubic force, the variance is 0.48 sigma / sqrt(cube).
         var = np.minimum(var, 0.48 * s.sigma / math.sqrt(cube))
     stiffness: FloatArray = abs(square) * np.sqrt(var) + cube * var
     return stiffness

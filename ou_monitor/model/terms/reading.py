@@ -79,7 +79,7 @@ class LopsidedNoise(Term):
 
     A draw is sinh((asinh(normal) + skew) / tail), standardised (Jones & Pewsey, Biometrika 96
     (2009) 761).  With skew < 0, dips are rarer and deeper than rises; with tail < 1, both tails
-    are heavier.  It has no effect without a `measurement_noise`.
+    are heavier.  Without a `measurement_noise`, the term has no effect.
     """
 
     NAME: ClassVar[str] = 'lopsided_noise'
@@ -116,16 +116,16 @@ class LopsidedNoise(Term):
         """Fit the scores if they are mostly white noise, with a free scale."""
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         found, paid = cls._best_fit(view)
-        # Heavy tails without asymmetry are left to other causes.
+        # Other causes describe heavy tails without asymmetry.
         return found if float(white.mean()) > _MOSTLY and paid else None
 
     def refit_law(self, view: View) -> LawFit:
-        """Fit again without conditions: the evidence decides whether the cause stays."""
+        """Fit again, without the conditions of `fit_law`: evidence decides if the cause stays."""
         return self._best_fit(view)[0]
 
     @classmethod
     def _best_fit(cls, view: View) -> tuple[LawFit, bool]:
-        """Return the fit, and whether asymmetry gains more than the penalty of a parameter."""
+        """Return the fit, and whether the asymmetry gains more than the penalty of a parameter."""
         z = view.z
         edges = np.unique(np.quantile(z[view.train], np.linspace(0.0, 1.0, _CELLS + 1)))
         cells = np.clip(np.searchsorted(edges, z[view.train]) - 1, 0, edges.size - 2)
@@ -148,8 +148,8 @@ class LopsidedNoise(Term):
         return fit, most - even > 0.5 * math.log(z[view.train].size)
 
 
-# Minimum share of white noise in the errors; number of bins of scores in a fit; limit of the
-# scores.
+# Minimum share of white noise in the one-step errors; number of bins of scores in a fit; limit of
+# the scores.
 _MOSTLY, _CELLS, _FARTHEST = 0.5, 400, 8.0
 # Points and weights for expectations over a normal distribution.
 _NORMAL = np.polynomial.hermite_e.hermegauss(80)
@@ -255,7 +255,7 @@ class HeldSamples(Term):
 
         def effect(s: Segment) -> None:
             nonlocal last, turn
-            # Tolerance for rounding: a stamp at an update has the new value.
+            # Tolerance for rounding, because a stamp at the time of an update has the new value.
             hair = 1e-6 + 2.0 * self.rate * np.spacing(np.abs(s.t))
             turns = np.floor((s.t - s.origin) * self.rate + hair)
             fresh = np.diff(turns, prepend=turn) > 0.0
@@ -291,10 +291,11 @@ class ClockJitter(Term):
         def effect(s: Segment) -> None:
             nonlocal last, stamp
             gap = np.diff(s.t, prepend=stamp)
-            # At the end of a segment the next step is unknown, so the previous one is used.
+            # Limit the error by the step before the sample, because at the end of a segment the
+            # next step is unknown.
             bound = np.where(np.isfinite(gap), 0.45 * gap, 0.0)
             error = self.std * rng.standard_normal(s.t.size)
-            # Times must not decrease, but with uneven stamps the errors may exchange two samples.
+            # With uneven stamps, the errors may swap two samples, but times must not decrease.
             s.at = np.maximum(np.maximum.accumulate(s.t + np.clip(error, -bound, bound)), last)
             s.step = np.diff(s.at, prepend=last)
             last, stamp = float(s.at[-1]), float(s.t[-1])
@@ -316,7 +317,7 @@ class ClockJitter(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit the hidden errors of the stamps, which show because longer steps add more noise."""
+        """Fit hidden errors of the stamps; they are visible, as longer steps add more noise."""
         return cls._best_fit(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:
@@ -332,8 +333,9 @@ class ClockJitter(Term):
         square = z * z
         if (float(np.mean(square**2)) > _MOST_KURTOSIS
                 or _square_correlation(square) > _MOST_CORRELATION):
-            # Not jitter: errors of at most half a step cause a smaller kurtosis, and a step that
-            # is too long makes the next one too short, so neighbouring squares anticorrelate.
+            # Not jitter: errors of at most half a step cause a smaller kurtosis.  Also, a step
+            # that is too long makes the next one too short, so jitter makes the correlation of
+            # neighbouring squares negative.
             return None
         state = view.state / np.sqrt(view.variance)
         z, inside = z[:_SHORT], state[view.train][:_SHORT]
@@ -382,10 +384,10 @@ def _square_correlation(square: FloatArray) -> float:
     return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
 
 
-# Number of samples in a fit; maximum fourth moment that jitter causes; maximum correlation of
-# neighbouring squares, in standard errors (jitter makes it negative).
+# Maximum number of samples in a fit; maximum fourth moment that jitter can cause; maximum
+# correlation of neighbouring squares, in standard errors.
 _SHORT, _MOST_KURTOSIS, _MOST_CORRELATION = 15000, 6.0, 4.0
-# Number of discrete levels of a stamp's error.
+# Number of discrete values of a stamp's error.
 _LEVELS = 7
 
 
@@ -395,9 +397,9 @@ _LEAST_JITTER = 1e-12
 
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return predicted probabilities of the last stamp's error, log densities, and laws."""
-    # Laws: stds and shifts of the score for pairs of successive errors, and the prior of an error.
-    # A shift is the effect of the error of the step, per unit of `state`.
+    """Return probabilities of the previous stamp's error, log densities, stds, shifts, prior."""
+    # Stds and shifts of the score are for pairs of successive errors; a shift is the effect of a
+    # wrong step, per unit of `state`.  The prior is the law of one error.
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)
     law /= law.sum()

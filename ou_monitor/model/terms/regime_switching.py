@@ -1,9 +1,9 @@
 """
 Markov switching of the mean or of sigma, unrelated to throttle.
 
-The filter of the Gaussian part assumes a constant level: after a change, its errors are large
-until it has converged to the new level, which takes longer with more white noise.  The progress of
-this convergence depends on all earlier states, which are approximated by their mean given the
+The Kalman filter of the Gaussian part assumes a constant level.  After a change of the level, its
+errors are large until it has converged to the new level, which takes longer with more white noise.
+The convergence depends on all earlier states, which are approximated by their mean given the
 samples so far (generalised pseudo-Bayesian filter of first order; Blom & Bar-Shalom, IEEE Trans.
 Autom. Control 33 (1988) 780).
 """
@@ -28,13 +28,13 @@ from scipy.special import ndtr
 
 # Median absolute value of a normal score.
 _MEDIAN = 0.6745
-# Filter gain above which it counts as 1; level, in standard deviations of an innovation, below
-# which it counts as 0.
+# Filter gain that counts as 1; level, in standard deviations of an innovation, below which it
+# counts as 0.
 _ALL, NO_LEVEL = 0.98, 0.2
 # Minimum correlation of adjacent residuals to fit an OU to the voltage without levels.
 _LEAST = 1e-3
-# Starting points: noise of the OU relative to the fit without levels; heights of the levels
-# relative to the spread.
+# Starting points: noise of the OU relative to the fit without levels, and heights of the levels
+# relative to the spread of the residual.
 _CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
@@ -71,7 +71,8 @@ class Scores:
     # Gain of the filter at the previous sample; shape (n,).
     trust: FloatArray
     step: float  # Time between samples, s
-    # Response of the filter to the states up to two samples ago, in levels; shape (n,).
+    # Response of the Kalman filter to the states up to two samples ago, in units of the level;
+    # shape (n,).
     followed: FloatArray
 
     @classmethod
@@ -101,7 +102,7 @@ class Scores:
         law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
         middle = float(law @ np.arange(states))
         std = np.exp(x[4] + x[3] * np.arange(states))
-        # The residual of a score for each pair of states, before `followed` is subtracted.
+        # Residual of a score for each pair of states, while `followed` is zero.
         direct = _direct(self, at_once, middle, states)
         height = x[2] * self.unit
         pairs = list(np.ndindex(states, states))
@@ -113,12 +114,12 @@ class Scores:
         exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
         for off, high, keep, draw, slow in columns:
-            # With at_once the filter follows the level, otherwise the rail behind the level.
+            # With at_once the filter follows the level, otherwise the rail, which lags behind it.
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind
             if states == 2:
-                # Unrolled, because half the time of a search was spent here.
+                # Unrolled, because a search spent half of its time here.
                 known = before[1] - middle
                 low, top = before
                 (a, b, c, d), (e, f) = off, scales
@@ -142,11 +143,11 @@ class Scores:
 
 
 def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray:
-    """Return the error that each pair of states predicts, in levels, while `followed` is zero."""
+    """Return the mean score, in levels, for each pair of states, while `followed` is zero."""
     direct = np.empty((states, states, s.z.size))
     for i, j in np.ndindex(states, states):
-        # If at_once, the new level less the filter's prediction from the old one; otherwise the
-        # pull towards the old one.
+        # With at_once, the new level less the filter's prediction from the old level; otherwise
+        # the pull towards the old level.
         direct[i, j] = ((j - middle) - s.phi * s.trust * (i - middle) if at_once
                         else (1.0 - s.phi) * (i - middle))
     return direct
@@ -155,8 +156,8 @@ def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray
 def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2,
              middle: float | None = None
              ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
-    """Return the arguments of `forward`, then means, (states, states, n), and stds by states."""
-    # middle: the mean of the states, in levels; by default the stationary law's.
+    """Return the arguments of `forward`; mean scores, (states, states, n); stds by state."""
+    # middle: mean state; by default the mean under the stationary law.
     state = np.arange(states, dtype=np.float64)
     chances = step_chances(x, s.step, states)
     law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
@@ -178,13 +179,13 @@ def moving(view: View, size: int) -> slice:
 
 
 def relaxing(view: View, faster: float) -> View:
-    """Return the view for a rail that relaxes faster than in the fit without levels."""
+    """Return the view for a rail that relaxes `faster` times as fast as in the present fit."""
     if faster == 1.0:
         return view
     phi = view.phi**faster
     e = view.z * np.sqrt(view.variance) + (view.phi - phi) * view.state
     inside = e[view.train]
-    # Most innovations are noise, even with large levels, so the median gives its size.
+    # Even with large levels, most innovations are noise, so their median gives its size.
     middle = float(np.median(inside))
     std = float(np.median(np.abs(inside - middle))) / _MEDIAN
     if not std > 0.0:
@@ -206,9 +207,9 @@ class Start:
 
 
 def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> Start | None:
-    """Return a start for levels beside white noise, and a view; None without white noise."""
-    # An `ou` that was fitted without levels absorbs them, so OUs with less noise are tried.
-    # Heights are tried up to twice the spread, V, where two levels explain all of it.
+    """Return a start for levels beside white noise; None without white noise."""
+    # An `ou` that was fitted without levels has absorbed them, so try OUs with less noise.  Try
+    # heights up to twice the spread, V, at which two levels explain all of the spread.
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
     best: tuple[float, Start] | None = None
@@ -227,7 +228,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> St
 
 
 def _with_less_noise(view: View, share: float) -> View:
-    """Return the view for an OU with a share of its noise, and the same white noise."""
+    """Return the view for an OU with a share of the fitted OU's noise, and equal white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
@@ -249,8 +250,8 @@ def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
 
 def without_levels(view: View, levels: FloatArray) -> View:
     """Return the view for an OU that is fitted to the voltage without the levels, V."""
-    # The OU has white noise if it then predicts the voltage without levels better; the parameters
-    # come from covariances at lags up to 2.
+    # White noise is added to the OU if that predicts the voltage without levels better; the
+    # parameters come from covariances at lags up to 2.
     r = (view.residual - levels)[view.train]
     r = r - r.mean()
     near, next_, far = (float(r[k:] @ r[:r.size - k]) / r.size for k in range(3))
@@ -285,13 +286,13 @@ def _dwells(view: View) -> FloatArray:
 
 
 def _densities(view: View, other: View) -> FloatArray:
-    """Return the log densities of the scores of a view, in the unit of another view's scores."""
+    """Return the log densities of a view's scores, per unit of another view's scores."""
     log: FloatArray = log_normal(view.z) - 0.5 * np.log(view.variance / other.variance)
     return log
 
 
 def _ahead(fit: LawFit, other: LawFit, part: slice) -> float:
-    """Return the log-likelihood of a fit less another fit's, in a part of the samples, nats."""
+    """Return the gain in log-likelihood of a fit over another in a part of the samples, nats."""
     return float((fit.gain - other.gain)[part].sum())
 
 
@@ -304,7 +305,7 @@ def _first_fits(view: View) -> list[Start]:
     for faster in _FASTER:
         relaxed = relaxing(view, faster)
         scores = Scores.of(relaxed).at_once
-        # Levels that hide a faster relaxation explain most of the spread.
+        # If levels hide a faster relaxation, they explain most of the spread.
         height = (1.0 if faster == 1.0 else 2.0) * spread / math.sqrt(
             float(np.median(relaxed.variance)))
         plain = _densities(view, relaxed)
@@ -342,12 +343,12 @@ _MOST = 5_000_000
 @dataclass(frozen=True)
 class RegimeSwitching(Term):
     """
-    Switch between two or three states, `level` apart; each higher one multiplies sigma.
+    Switch between two or three states, `level` apart; `sigma_ratio` multiplies sigma per state.
 
-    The level `u0` of the `ou` is the mean over the states, its sigma the lowest state's.  The rate
-    from a state to each higher one is `rate_up`, to each lower one `rate_down`.  Exact in law:
-    switching times are drawn, and sigma is integrated over the parts of a step in which it is
-    constant.
+    The level `u0` of the `ou` is the mean over the states, and its sigma applies to the lowest
+    state.  The rate from a state to each higher state is `rate_up`, to each lower state
+    `rate_down`.  Exact in law: switching times are drawn, and sigma^2 is integrated over the parts
+    of a step in which it is constant.
     """
 
     NAME: ClassVar[str] = 'regime_switching'
@@ -410,8 +411,7 @@ class RegimeSwitching(Term):
             now = entered[np.searchsorted(when, s.at, side='right')]
             before = np.concatenate(([entered[0]], now[:-1]))
             s.level += self.at_once * self.level * (now - middle)
-            # A change within a step affects only the share of the pull and of the noise that
-            # comes after it.
+            # A change within a step affects only the part of the step after the change.
             k = np.searchsorted(s.at, when)
             slow = (1.0 - self.at_once) * self.level
             if slow != 0.0:
@@ -429,7 +429,7 @@ class RegimeSwitching(Term):
         return effect
 
     def holds(self, view: View) -> bool:
-        """Return whether the expected number of changes suffices for a random process."""
+        """Return whether enough changes are expected to call them a random process."""
         rates = rates_between(self.rate_up, self.rate_down, int(self.states))
         span = float(view.at[view.train.stop - 1] - view.at[0])
         return float(stationary_law(rates) @ rates.sum(axis=1)) * span >= _CHANGES
@@ -450,7 +450,7 @@ class RegimeSwitching(Term):
             if fit is None:
                 continue
             if start.to_refine and fit.offset is not None:
-                # The voltage without levels gives a better OU.
+                # Fit the OU again to the voltage without the levels.
                 starts.append(_fit_again(fit, start, without_levels(view, fit.offset)))
             if start.view is not view:
                 fit = replace(fit, gain=fit.gain + log_normal(start.view.z)
@@ -467,9 +467,9 @@ class RegimeSwitching(Term):
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
-                # In this view one OU covers levels and noise; the next fit separates them.
+                # In this view, one OU describes levels and noise; the next fit separates them.
                 return cls._best_fit(view, [slow], 0.0, 1, states) or two
-        # As in the two states, the three differ in sigma, or in the level.
+        # Let three states differ in what differs between the two states: sigma or level.
         trials = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
             trials = [start.x * [1.0, 1.0, 0.6, 0.0, 1.0]]
@@ -487,8 +487,8 @@ class RegimeSwitching(Term):
         states = int(self.states)
         law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        # Start from two scales: the scores' mean square (1 if levels are clear), and 1, which is
-        # right if the `ou` already has the sigma of the lowest state.
+        # Start from two scales: one from the mean square of the scores (1 if levels are clear),
+        # and 1, which is right if the `ou` already has the sigma of the lowest state.
         mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
         starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
                             ratio, scale])
@@ -510,7 +510,7 @@ class RegimeSwitching(Term):
 
         start = max(starts, key=value)
         if states == 2:
-            # Rates from few changes are inaccurate starts; try counts over all samples too.
+            # Rates fitted to few changes are inaccurate; try rates counted over all samples too.
             counted = _counted_rates(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
             start = max(np.array(start), np.append(counted, start[2:]), key=value)
         x, top = climb(value, start, size=0.2, most=most)
@@ -525,7 +525,7 @@ class RegimeSwitching(Term):
         normal = normal_scores(chance)
         term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]),
                    at_once, float(states))
-        # `u0` is fitted too, so the rates do not move the levels.
+        # Keep the mean state fixed: `u0` is fitted too, so the rates must not move the levels.
         middle = float(chain[2] @ np.arange(states))
         e = curvature_se(lambda x: value(x, middle), x)
         se = {'rate_up': term.rate_up * float(e[0]), 'rate_down': term.rate_down * float(e[1]),
@@ -537,7 +537,7 @@ class RegimeSwitching(Term):
         offset = None if abs(x[2]) < NO_LEVEL else moved
         # Probabilities of the states, given the samples so far.
         known = np.concatenate((before[1:], before[-1:]))
-        # Relative to the lowest state, whose sigma thus becomes the sigma of the `ou`.
+        # Relative to the lowest state, so that the `ou` gets the sigma of the lowest state.
         power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
         return LawFit(term, se, normal, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
@@ -554,8 +554,9 @@ def _counted_rates(before: FloatArray, step: float) -> FloatArray:
 
 def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     """Return a start for levels much slower than the noise, its evidence, and their number."""
-    # Means over half a relaxation time are modelled as levels plus first-order noise.  The noise's
-    # correlation is fitted too, because the samples' correlation includes the levels.
+    # Means over half a relaxation time are modelled as levels plus first-order noise.  The
+    # correlation of this noise is fitted too, because the correlation of the samples includes the
+    # levels.
     r = view.residual[view.train]
     a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))
     size = max(1, round(0.5 / a))
@@ -568,7 +569,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
         return None, 0.0, 2
     mean = (mean - mean.mean()) / spread
     step = size / view.rate
-    # Weights, so that noise that depends on throttle is not mistaken for levels.
+    # Weight the means, so that noise that depends on throttle is not mistaken for levels.
     noisy = view.variance[view.train][:count * size].reshape(count, size).mean(axis=1)[1:]
     noisy /= math.exp(float(np.mean(np.log(noisy))))
 
@@ -605,9 +606,9 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
 
 # Factors by which the rail may relax faster than in a fit without levels.
 _FASTER = 1.0, 3.0, 9.0
-# Minimum evidence to try slow levels, nats.
+# Minimum evidence for slow levels, nats.
 _SLOW_AHEAD = 8.0
-# Number of samples to compare starts, and to fit from the best start.
+# Number of samples for comparing starts, and for fitting from the best start.
 _SHORT, _LONG = 8000, 30000
 # Maximum rate of switching, 1/s.
 _FASTEST = 30.0
@@ -620,7 +621,7 @@ _NO_RATIO = 0.05
 
 
 def _fastest(view: View) -> float:
-    """Return ln of the maximum rate: states of a few samples are another cause."""
+    """Return ln of the maximum rate; states that last only a few samples are another cause."""
     return math.log(min(_FASTEST, view.rate / 20.0))
 
 

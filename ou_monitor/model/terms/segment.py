@@ -15,7 +15,7 @@ from ou_monitor.records import FloatArray
 
 
 class Stage(enum.IntEnum):
-    """When a term acts on the samples, from the clock to the logger."""
+    """Order in which terms act on the samples, from the clock to the logger."""
 
     CLOCK = 0
     DRIVE = 1
@@ -37,7 +37,7 @@ class Segment:
     # Time since the previous sample, s; infinite before the first, which has the stationary law;
     # shape (n,).
     step: FloatArray
-    throttle: FloatArray  # 0..1, each for the time since the previous stamp; shape (n,)
+    throttle: FloatArray  # 0..1, each value for the time since the previous stamp; shape (n,)
     origin: float  # Stamp of the first sample of the recording, s
     # Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample; shape (n,).
     alpha: FloatArray
@@ -51,7 +51,7 @@ class Segment:
     noise: FloatArray  # Factor on the std of the white measurement noise; shape (n,)
     voltage: FloatArray  # Reading, V; shape (n,)
     slope: FloatArray | float = 0.0  # Slope of the lines, V/s; shape (n,); only for likelihoods
-    # Transformations of the normal draws of the white noise, in order.
+    # Transformations of the normal draws of the white noise, in the order of their application.
     shape: list[Callable[[FloatArray], FloatArray]] = field(default_factory=list)
 
     @property

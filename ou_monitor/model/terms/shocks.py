@@ -1,4 +1,4 @@
-"""Rare events: steps that relax, bad samples, heavy tails."""
+"""Rare events: jumps that relax, bad samples, heavy tails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ou_monitor.records import FloatArray
 from scipy.special import gammainccinv, gammaincinv, ndtr
 
 
-# Minimum of a sum of squares in a denominator.
+# Minimum denominator.
 _TINY = 1e-280
 # Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
@@ -26,7 +26,7 @@ _OFTEN = 0.05
 
 @dataclass(frozen=True)
 class Jumps(Term):
-    """Add normal jumps to the state, at the instants of a Poisson process."""
+    """Add jumps of normally distributed size to the state, at the times of a Poisson process."""
 
     NAME: ClassVar[str] = 'jumps'
     FAMILY: ClassVar[str] = 'events'
@@ -75,14 +75,14 @@ class Jumps(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a mixture to the scores: most are N(0, 1), some contain a jump."""
+        """Fit a mixture to the scores: most are N(0, 1), and some contain a jump."""
         z, var = view.z, view.variance
         found = _mixture(z[view.train], var[view.train])
         if found is None:
             return None
         share, mean, spread, unit = found
         if share > _OFTEN:
-            # Jumps this frequent are not events: the noise itself has another distribution.
+            # Jumps are not this frequent: the noise itself has another distribution.
             return None
         log_calm, log_jump = _parts(z, var, share, mean, spread, unit)
         both = np.logaddexp(log_calm, log_jump)
@@ -125,7 +125,7 @@ def _mixture(z: FloatArray, var: FloatArray) -> tuple[float, float, float, float
             return None
         before = share
         share = min(total / z.size, 0.5)
-        # Share of an innovation that the jump explains, given both variances.
+        # Share of an innovation that is due to the jump, given both variances.
         part = spread * spread / (spread * spread + unit * unit * var)
         size = mean + part * (z * s - mean)
         mean = float((weight * size).sum()) / total
@@ -174,8 +174,8 @@ class Glitches(Term):
     def fit_law(cls, view: View) -> LawFit | None:
         """Find runs of up to three samples that contradict their neighbours on both sides."""
         # Use errors and variances of a filter without measurement noise, in which a sample affects
-        # only the next one.  The scale is a median, because bad samples have increased the fitted
-        # noise.
+        # only the next sample.  Take the scale from a median, because bad samples have increased
+        # the fitted noise.
         own = view.variance * (view.driven + (1.0 - view.trust) * (1.0 + view.phi ** 2))
         plain = (view.residual - view.phi * view.state) / np.sqrt(own)
         unit = float(np.median(np.abs(plain))) / 0.6745
@@ -198,7 +198,7 @@ class Glitches(Term):
         scores, gain, free = _glitch_scores(view, bad, share, spread, lengths)
         se = {'probability': term.probability / math.sqrt(count),
               'std': spread / math.sqrt(2.0 * count)}
-        # The variance of the error makes the next fit ignore the bad samples.
+        # With this variance of the error, the next fit ignores the bad samples.
         return LawFit(term, se, scores, gain, free,
                       error=np.where(bad, spread * spread, 0.0))
 
@@ -206,7 +206,7 @@ class Glitches(Term):
 def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
                    lengths: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Return normal scores, gains in log density, and the number of parameters."""
-    # States: good, and the first, second and third sample of a run with similar errors.
+    # States: a good sample; first, second and third sample of a run with similar errors.
     e = view.z * np.sqrt(view.variance)
     keep, rest = _repetition(e, bad, view.train, spread)
     wide = np.sqrt(1.0 + spread * spread / view.variance)
@@ -214,7 +214,7 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
     mean = keep * np.concatenate(([0.0], e[:-1])) / np.sqrt(view.variance)
     calm, hit = log_normal(view.z), log_normal(view.z, 0.0, wide * wide)
     more = log_normal(view.z, mean, again * again)
-    # Density for each transition: 0 no error, 1 a new error, 2 a similar error again.
+    # Index of the density for each transition: 0 no error, 1 a new error, 2 a similar error again.
     which = np.array([[0, 1, 0, 0], [0, 0, 2, 0], [0, 0, 0, 2], [0, 0, 0, 0]])
     go = 1.0 - lengths[0], lengths[2] / (lengths[1] + lengths[2])
     transition = np.array([[1.0 - share, share, 0.0, 0.0], [1.0 - go[0], 0.0, go[0], 0.0],
@@ -225,8 +225,9 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
     chance = np.stack([before @ (transition * (which == k)).sum(axis=1) for k in range(3)])
     scores = normal_scores(chance[0] * ndtr(view.z) + chance[1] * ndtr(view.z / wide)
                            + chance[2] * ndtr((view.z - mean) / again))
-    # The filter leaves out the bad samples, which were chosen in hindsight.  So each choice pays
-    # its prior probability in full: a mixture would pay too little for a small error.
+    # The filter leaves out the bad samples, which were chosen in hindsight.  So the prior
+    # probability of each choice is subtracted in full: a mixture would subtract too little for a
+    # small error.
     place = np.arange(e.size)
     state = place - np.maximum.accumulate(np.where(bad, -1, place))
     change = state[:-1], state[1:]
@@ -237,7 +238,7 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
 
 def _repetition(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
                 ) -> tuple[float, float]:
-    """Return slope and residual std, V, of errors regressed on the previous error of their run."""
+    """Regress each error on the previous error of its run; return slope and residual std, V."""
     e, bad = e[train], bad[train]
     second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
     if second.size < _PAIRS:
@@ -246,7 +247,7 @@ def _repetition(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread:
     return keep, float(np.std(e[second] - keep * e[second - 1]))
 
 
-# Minimum pairs of adjacent bad samples to tell whether their errors are similar.
+# Minimum number of pairs of adjacent bad samples for a regression of their errors.
 _PAIRS = 8
 
 
@@ -265,8 +266,8 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
     begins, ends, gains = [], [], []
     for width in (1, 2, 3):
         first = np.arange(1, n - width)
-        # Leaving out samples k..k+width-1 replaces the innovations k..k+width by one, from
-        # sample k-1 to k+width.
+        # Without samples k..k+width-1, a single innovation, from sample k-1 to k+width, replaces
+        # the innovations k..k+width.
         run, weight, power = z[first + width].copy(), np.ones(first.size), np.ones(first.size)
         before = run**2
         for j in range(width - 1, -1, -1):
@@ -284,7 +285,7 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
 
 
 def outlying(voltage: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which readings, V, contradict an AR(1) fitted to them; shape (n,)."""
+    """Return which readings, V, contradict an AR(1) fitted to the readings; shape (n,)."""
     bad = np.zeros(voltage.size, dtype=np.bool_)
     # The second round estimates the AR(1) without the outliers of the first.
     for _ in range(2):
@@ -308,7 +309,8 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
     """Return the samples of the best set of runs (weighted interval scheduling)."""
     order = np.argsort(end, kind='stable')
     begin, end = begin[order], end[order]
-    # For each run, how many runs end before it begins (a run uses the innovation at its end).
+    # For each run, the number of runs that end before it begins (a run uses the innovation at its
+    # end, so the next run must begin later).
     clear = np.searchsorted(end, begin, side='left').tolist()
     best, taken = [0.0], []
     for value, k in zip(gain[order].tolist(), clear, strict=True):
@@ -327,7 +329,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """Make the noise of each step Student-t, with equal variance; dof depends on the spacing."""
+    """Make the noise of each step Student-t with unchanged variance; dof is for this spacing."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'
@@ -373,9 +375,9 @@ class _Mixture:
     """Scores that are the sum of a Student-t part and a normal part."""
 
     def __init__(self, square: FloatArray, share: FloatArray, dof: float, scale: float) -> None:
-        # A Student-t is a normal distribution whose variance is inverse-gamma distributed; the
-        # integral over the variance is a sum over a fine grid in its logarithm.  `log` are the log
-        # densities of the scores.
+        # A Student-t is a normal distribution whose variance has an inverse-gamma distribution;
+        # the integral over the variance is a sum over a fine grid of its logarithm.  `log`
+        # contains the log densities of the scores.
         if dof <= 2.0:
             self.log: FloatArray = np.full(square.size, -math.inf)
             return
@@ -383,7 +385,7 @@ class _Mixture:
         ends = np.log(gammaincinv(half, _OUTSIDE)), np.log(gammainccinv(half, _OUTSIDE))
         gamma = np.exp(np.linspace(*ends, _POINTS))
         log = half * np.log(gamma) - gamma
-        # Use logarithms, because most weights underflow with many degrees of freedom.
+        # Use logarithms, because with many degrees of freedom most weights underflow.
         log -= log.max()
         log -= math.log(float(np.exp(log).sum()))
         self._weight = np.exp(log)
@@ -416,11 +418,11 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     return (np.bincount(cell, z * z) / count, np.bincount(cell, share) / count, count)
 
 
-# Minimum share of the Student-t part in the variance to give each sample a `power`.  With white
-# noise, the powers would also explain the white noise, so that the next fit would not find it;
-# without powers the variance is still right.
+# Minimum share of the Student-t part in the variance, for giving each sample a `power`.  If there
+# is white noise, powers would explain it too, so that the next fit would not find it; without
+# powers the variance is still right.
 _ALONE = 0.99
-# Number of points of the variance, and probability outside their range; in a fit, number of bins
-# of share, and number and width of bins of asinh(score).
+# Number of grid points of the variance, and probability on either side of the grid; for a fit:
+# number of bins of the share, and number and width of bins of asinh(score).
 _POINTS, _OUTSIDE = 40, 1e-10
 _SHARES, _CELLS, _WIDTH = 8, 300, 0.03

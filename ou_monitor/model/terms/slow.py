@@ -1,4 +1,4 @@
-"""Slow parts beside the OU: a trend, a second relaxation, 1/f noise."""
+"""Slow changes besides the OU: a trend, a second relaxation, 1/f noise."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Drift(Term):
             'rate', *(name for name in ('curvature', 'charge') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
-    # The inexact form of a larger effect always leaves a little for a trend to explain.
+    # The form of a larger effect is never exact, which leaves a little for a trend to explain.
     LEAST_SHARE: ClassVar[float] = 0.02
     MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
     REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'
@@ -70,8 +70,8 @@ class Drift(Term):
             *forms, *(replace(form, charge=NEXT_TO_ZERO) for form in forms))
 
 
-# Minimum number of relaxation times in a recording, and maximum in a step: with more, white noise
-# explains the data, because at most 5 % of the deviation reaches the next sample.
+# Minimum number of relaxation times in a recording, and maximum number in a step: with more, at
+# most 5 % of a deviation reaches the next sample, so the noise looks white.
 _LEAST = 3.0
 
 
@@ -134,14 +134,15 @@ class SecondRelaxation(Term):
         return phi[:, None, None], q[:, None, None], np.ones(1)
 
 
-# Octaves between poles, to simulate (spectrum 1/f within 0.2 %) and to fit (within 6 %).
+# Octaves between poles, for simulations (before the low-pass, 1/f within 0.2 %) and for fits
+# (within 6 %).
 _FINE, _COARSE = 0.5, 3.0
 # Relaxation times in a step above which the previous state is negligible (exp(-20) = 2e-9).
 _FORGOTTEN = 20.0
-# Last pole, and corner of the low-pass, relative to the upper frequency.  The low-pass removes 1.5
-# % at the upper frequency, and most of the noise above the last pole.
+# Last pole, and corner of the low-pass, relative to the upper frequency.  The low-pass removes
+# 1.5 % at the upper frequency, and most of the noise above the last pole.
 _LADDER, _CORNER = 4.5, 8.0
-# Minimum ratio of the corner to the lower frequency; below it one or two relaxations suffice.
+# Minimum ratio of the corner to the lower frequency; below it, one or two relaxations suffice.
 _LEAST_SPAN = 30.0
 
 
@@ -150,9 +151,10 @@ class FlickerNoise(Term):
     """
     Add noise of PSD amplitude^2 / f between two frequencies.
 
-    A sum of OUs, two per octave, behind a first-order low-pass at 8 * high.  Its one-sided PSD
-    follows 1/f within 2 % from `low` to `high`, is flat below, and falls as 1/f^3, then 1/f^4
-    above the corner, like noise behind a circuit of that bandwidth.  Exact in law at any spacing.
+    A sum of OUs, two per octave, behind a first-order low-pass at 8 * high.  The one-sided PSD
+    follows 1/f within 2 % from `low` to `high`, is flat below `low`, and falls as 1/f^3, then as
+    1/f^4, above the corner, like noise behind a circuit of that bandwidth.  Exact in law at any
+    spacing.
     """
 
     NAME: ClassVar[str] = 'flicker_noise'
@@ -163,7 +165,7 @@ class FlickerNoise(Term):
     SLOW_FIT: ClassVar[bool] = True
     BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
-    # The minimum; the number grows by one every three octaves.
+    # Minimum number of states; it grows by one every three octaves.
     STATES: ClassVar[int] = 4
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
     MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
@@ -171,7 +173,7 @@ class FlickerNoise(Term):
         'Alpha holds only for windows of this length; compare only windows of equal length.')
     SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
 
-    amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)
+    amplitude: float = parameter('V', 'square root of (f times PSD)', 0.0)
     low: float = parameter('Hz', 'lower end', 0.0, above=True)
     high: float = parameter('Hz', 'upper end; 1/8 of the corner of the low-pass', 0.0,
                             above=True)
@@ -245,7 +247,7 @@ class FlickerNoise(Term):
         return bool(_CORNER * self.high > _LEAST_SPAN * self.low)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return one state for each pole, and the low-pass; for a fit, few poles suffice."""
+        """Return one state for each pole and one for the low-pass; for fits, few poles suffice."""
         poles, variances = _sum(self.low, _LADDER * self.high, _COARSE)
         variances = self.amplitude ** 2 * variances
         # Most recordings have only a few different steps.
@@ -286,9 +288,9 @@ def _bridge(pole: float, rate: float, step: FloatArray
 
 def _sum(low: float, high: float, octaves: float) -> tuple[FloatArray, FloatArray]:
     """Return relaxation rates, 1/s, and variances whose one-sided PSD is nearly 1/f, V^2/Hz."""
-    # The integral of 4 a / (a^2 + w^2) d(ln a) over all rates a is 1/f.  It is computed between
-    # the ends by the midpoint rule, and below and above them (in a and in 1/a) by two-point
-    # Gauss-Legendre quadrature.
+    # The integral of 4 a / (a^2 + w^2) d(ln a) over all rates a is 1/f.  It is computed by the
+    # midpoint rule between the ends, and by two-point Gauss-Legendre quadrature below the lower
+    # end (in a) and above the upper end (in 1/a).
     count = max(1, math.ceil(math.log2(high / low) / octaves))
     width = math.log(high / low) / count
     inner = low * np.exp(width * (np.arange(count) + 0.5))

@@ -2,11 +2,11 @@
 Base of all terms: named parameters with units, a simulator, a likelihood, explanations.
 
 A term defines its effect on a `Segment` of samples.  Each simulator has its own
-generator and keeps its state from segment to segment, so a recording depends neither
-on the division into segments nor on the draws of other terms.
+generator and keeps its state from segment to segment, so a simulated recording depends
+neither on the division into segments nor on the draws of other terms.
 
-Each class with a NAME in this folder that is derived from `Term` is a cause: search,
-reports and model files find it through `catalogue`, and use the attributes of the class.
+Each class in this folder that has a NAME and is derived from `Term` is a cause: search,
+reports and model files find the class through `catalogue`, and use its attributes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ou_monitor.records import FloatArray
 
 Value = TypeVar('Value')
 
-# Initial value of a coefficient that is to be fitted; a coefficient of exactly 0 is not.
+# Initial value of a coefficient that is to be fitted; a coefficient of exactly 0 is not fitted.
 NEXT_TO_ZERO = 1e-12
 
 
@@ -48,7 +48,7 @@ class Role(enum.Enum):
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
               above: bool = False, default: float | None = None, label: str = '') -> Any:
     """Declare a parameter; one with a default may be omitted, also in a model file."""
-    # label: name in texts, if it differs from the name of the attribute.
+    # label: name of the parameter in texts, if it differs from the name of the attribute.
     about = {'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above, 'label': label}
     return field(metadata=about) if default is None else field(default=default, metadata=about)
 
@@ -93,45 +93,47 @@ class Term:
     # Name and family in model files and findings.
     NAME: ClassVar[str] = ''
     FAMILY: ClassVar[str] = ''
-    # When it acts in a simulation.
+    # When the term acts in a simulation.
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = False
-    # How it enters a likelihood.
+    # How the term enters a likelihood.
     ROLE: ClassVar[Role] = Role.MEAN
     # Parameters that multiply known columns (`Role.MEAN`).
     LINEAR: ClassVar[tuple[str, ...]] = ()
     # Positive parameters found by maximum likelihood, on a log scale (`DRIVE`, `BLOCK`, `NOISE`).
     FREE: ClassVar[tuple[str, ...]] = ()
-    # Prefixes of the names of the statistics that indicate this term; a leading + or - means that
-    # only deviations of that sign do.
+    # Prefixes of the names of the statistics that indicate this term; a leading + or - restricts
+    # this to deviations of that sign.
     SIGNS: ClassVar[tuple[str, ...]] = ()
-    # Whether it depends on throttle or time only; the search tries it before latent causes.
+    # Whether the term depends on throttle or time only; the search tries such terms before latent
+    # causes.
     MEASURED: ClassVar[bool] = False
-    # Causes that are hard to distinguish from it: the search does not add one of a pair to the
-    # other.  It is enough to name the pair in one of the two classes.
+    # Causes that are hard to distinguish from this one: the search does not add one of such a pair
+    # to the other.  One of the two classes has to name the other.
     IMITATES: ClassVar[tuple[str, ...]] = ()
-    # Whether a model can have several, and whether the search looks for another one.
+    # Whether a model can have several terms of this class, and whether the search looks for more
+    # after it has found one.
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
-    # Minimum evidence, relative to the strongest cause's.
+    # Minimum evidence, as a share of the strongest cause's evidence.
     LEAST_SHARE: ClassVar[float] = 0.0
-    # Maximum ratio of the indicating statistics after and before the fit; 0: none may fail.
+    # Share of its value before the fit that an indicating statistic may keep; 0: none may fail.
     MAY_LEAVE: ClassVar[float] = 0.0
     # Statistics that must not fail after the fit.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
-    # Penalty for choices of the search, in addition to the penalty for free parameters, nats.
+    # Penalty for the choices of the search, nats, in addition to the penalty for free parameters.
     SEARCH: ClassVar[float] = 0.0
     # Number of parameters that `apart` fits, outside the joint fit.
     APART: ClassVar[int] = 0
-    # Whether a fit takes seconds; late in a search no such fit is started.
+    # Whether a fit takes seconds; late in a search, such fits are skipped.
     SLOW_FIT: ClassVar[bool] = False
-    # Whether its spectrum is broad and stationary; then a fit starts from the scores' spectrum.
+    # Whether the spectrum is broad and stationary; then a fit starts from the scores' spectrum.
     BROAD: ClassVar[bool] = False
-    # Number of states that it adds to the linear system (`Role.BLOCK`).
+    # Number of states that the term adds to the linear system (`Role.BLOCK`).
     STATES: ClassVar[int] = 0
-    # The term that it modifies, which the model must contain; None: the `ou`.
+    # The term that this one modifies, which the model must contain; None: the `ou`.
     CHANGES: ClassVar[type[Term] | None] = None
-    # Whether the live estimate, at the present throttle, includes its effect.
+    # Whether the live estimate, which is for the present throttle, includes the effect.
     LIVE: ClassVar[bool] = False
     # Texts for the report: meaning, remedy, and a recording that separates it from other causes.
     MEANING: ClassVar[str] = ''
@@ -197,19 +199,19 @@ class Term:
         return replace(self, **dict(zip(self.LINEAR, map(float, beta), strict=True)))
 
     def factors(self) -> dict[str, tuple[list[float], list[float]]]:
-        """Return readable knots and factors on the noise by input, if parameters are lists."""
+        """Return knots and factors on the noise by input, if the parameters are such lists."""
         return {}
 
     def free(self) -> tuple[str, ...]:
-        """Return the names of the coordinates for maximum likelihood."""
+        """Return the names of the coordinates over which the likelihood is maximised."""
         return self.FREE
 
     def moved(self, name: str, by: float) -> Self:
-        """Return the term with one coordinate (by default the parameter's logarithm) moved."""
+        """Return the term with one coordinate changed (by default the parameter's logarithm)."""
         return replace(self, **{name: getattr(self, name) * math.exp(by)})
 
     def apart(self, view: View) -> Self:
-        """Return the term with its `APART` parameters refitted to scores of a model with it."""
+        """Refit the `APART` parameters to the scores of a model that contains this term."""
         return self
 
     def per_coordinate(self, name: str) -> float:
@@ -231,7 +233,7 @@ class Term:
         return 0.0
 
     def variances(self, s: Segment) -> FloatArray | float:
-        """Return `variance`, at each sample of a segment if a measured input changes it."""
+        """Return the variance at each sample of a segment; one number if it is constant."""
         return self.variance()
 
     @classmethod
@@ -272,7 +274,7 @@ class Term:
 
     @classmethod
     def read(cls, params: Mapping[str, Any]) -> Self:
-        """Return a term from its parameters; a ValueError names missing and unknown ones."""
+        """Return a term from its parameters; a ValueError names missing or unknown ones."""
         names = cls.parameters()
         missing = [name for name in names if name not in {**cls.usual(), **params}]
         unknown = [name for name in params if name not in names]
@@ -301,11 +303,11 @@ class LawFit:
     free: int  # Number of fitted parameters
     push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
     error: FloatArray | None = None  # Variance that events add to the measurement, V^2; shape (n,)
-    # Estimated factor on the variance of the noise in the step before each sample (inverse of the
-    # mean precision); shape (n,).
+    # Factor on the variance of the OU noise in the step before each sample: the inverse of the
+    # mean precision; shape (n,).
     power: FloatArray | None = None
     white: FloatArray | None = None  # The same for the variance of the white noise; shape (n,)
-    # Voltage that the law adds to the level, V, to be subtracted before the Gaussian fit; (n,).
+    # Voltage that the law adds to the level, V; subtracted before the Gaussian fit; shape (n,).
     offset: FloatArray | None = None
 
 

@@ -1,4 +1,4 @@
-"""Spectral lines: at a fixed frequency, from a resonance, or following throttle."""
+"""Spectral lines: of a tone, of a resonance, and of a tone whose frequency follows throttle."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class Tone(Term):
-    """Add a sine; its phase is a random walk, which makes its line `linewidth` wide."""
+    """Add a sine whose phase is a random walk, so that its spectral line is `linewidth` wide."""
 
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
-    # With a wandering phase, the term has two states instead of known columns.
+    # If the phase wanders, the term has two states instead of known columns.
     ROLE: ClassVar[Role] = by_parameters(
         Role.MEAN, lambda term: Role.BLOCK if term.linewidth else Role.MEAN)
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
@@ -73,7 +73,7 @@ class Tone(Term):
 
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
-        """Return a starting point at the frequency of a line, refined on the whole recording."""
+        """Return a starting point at the frequency of a line, refined over the whole recording."""
         grid = on_grid(view.at, view.z)
         wave = fit_sinusoid(grid.values, grid.rate, line.frequency, line.resolution)
         return cls(0.0, wave.frequency, 0.0, 0.0)
@@ -104,22 +104,24 @@ class Tone(Term):
         return [self.amplitude * math.cos(self.phase), self.amplitude * math.sin(self.phase)]
 
     def with_linear(self, beta: Sequence[float]) -> Tone:
-        """Return the line with these coefficients."""
+        """Return the tone with these coefficients."""
         return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))
 
 
 def lines_of(view: View) -> tuple[Line, ...]:
     """Return the lines of the residual, strongest first."""
-    # Include the held-out part, because a line may begin late; its frequency is searched for, not
-    # fitted, and a penalty covers the search.
+    # Include the held-out part, because a line may begin late.  This is fair, because the
+    # frequency is searched for, not fitted, and a penalty covers the search.
     grid = on_grid(view.at, view.z)
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED, wide=True).lines
 
 
-# Maximum number of lines tried; their false-alarm probability, large because evidence decides.
+# Maximum number of lines tried, and their false-alarm probability, which is large because the
+# evidence decides later.
 _MOST, _PROPOSED = 3, 0.5
-# A fit starts from two linewidths: this one, in resolutions of the recording, and its geometric
-# mean with the maximum.  Linewidth, Hz, from which a line's amplitude must be constant.
+# A fit starts from two linewidths: _WANDERS, in units of the recording's resolution, and the
+# geometric mean of that and the maximum.  A line wider than WIDEST, Hz, must have a constant
+# amplitude; otherwise it is ringing.
 _WANDERS, WIDEST = 3.0, 2.0
 # Maximum width of a line relative to its frequency.
 SHARP = 0.05
@@ -150,9 +152,9 @@ class Resonance(Term):
     STATES: ClassVar[int] = 2
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
-    # A broad line fits almost any spectrum.
+    # A limit is needed, because a broad line fits almost any spectrum.
     MAY_LEAVE: ClassVar[float] = 0.1
-    # Ringing driven by noise is Gaussian: without bursts and third moments.
+    # Ringing that is driven by noise is Gaussian, so it has no bursts and no third moments.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ('bursts', 'products of three')
     MEANING: ClassVar[str] = 'The rail rings: inductance of the leads against the capacitors.'
     REMEDY: ClassVar[str] = 'Damp it with a resistive (electrolytic) capacitor or shorter leads.'
@@ -215,12 +217,12 @@ class Resonance(Term):
     def holds(self, view: View) -> bool:
         """Return whether it oscillates, and decays faster than a line."""
         width = self.damping / math.pi
-        # Too wide for a tone, or a tone whose amplitude varies.
+        # It is ringing if it is too wide for a tone, or if its amplitude varies.
         return width < 2.0 * self.frequency and (width >= SHARP * self.frequency or (
             width > WIDEST and not power_spread(view, self.frequency, width) < RINGING))
 
 
-# Initial and maximum tilt: at 1, a step would add no noise to one of the states.
+# Initial and maximum |tilt|: at 1, a step would add no noise to one of the states.
 _STEEP, _STEEPEST = 0.9, 0.99
 
 
@@ -289,9 +291,10 @@ class ThrottleTone(Term):
         return rotation(turn, damping, s.step, self.amplitude / math.sqrt(2.0))
 
 
-# Minimum movement of a line over the range of throttle, in bins; lines that move less are tones.
+# Minimum change of a line's frequency over the range of throttle, in bins; lines that change less
+# are tones.
 _MOVES = 30.0
-# Minimum movement of the line by one standard deviation of throttle, in widths of the line.
+# Minimum change of a line's frequency by one standard deviation of throttle, in linewidths.
 _MORE = 1.0
 # Minimum linewidth of the two states, Hz.
 _NARROWEST = 1e-4

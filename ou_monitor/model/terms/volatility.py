@@ -19,7 +19,7 @@ from scipy.special import comb, digamma, ndtr
 
 @dataclass(frozen=True)
 class Volatility(Term):
-    """Multiply sigma and the white noise by the exponential of an OU, constant within a step."""
+    """Multiply sigma and white noise by exp(a second OU), which is constant within a step."""
 
     NAME: ClassVar[str] = 'volatility'
     FAMILY: ClassVar[str] = 'intensity'
@@ -62,7 +62,7 @@ class Volatility(Term):
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
     def holds(self, view: View) -> bool:
-        """Return whether the recording has enough relaxation times; if not, sigma has a trend."""
+        """Return whether the recording has enough relaxation times; else sigma has a trend."""
         return self.rate * float(view.at[-1]) > _WANDERS
 
     @classmethod
@@ -95,7 +95,7 @@ class Volatility(Term):
         log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
             :, None] * np.exp(-2.0 * levels)
         weight = np.exp(log - log.max(axis=1)[:, None])
-        # Relative to the median, which thus becomes the sigma of the `ou`.
+        # Relative to the median, so that the `ou` gets the median of sigma.
         power = weight.sum(axis=1) / (weight @ np.exp(2.0 * (x[2] - levels)))
         power = np.repeat(power, size)[:view.z.size]
         return LawFit(term, {'std': term.std * float(e[0]), 'rate': term.rate * float(e[1])},
@@ -103,7 +103,7 @@ class Volatility(Term):
 
 
 def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
-    """Return the samples per segment, each segment's sum of squares, and its actual size."""
+    """Return the samples per segment, and the sum of squares and the actual size of each."""
     n = view.z.size
     size = max(1, n // _SEGMENTS)
     begin = np.arange(0, n, size)
@@ -113,8 +113,8 @@ def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
 
 def _start(view: View) -> FloatArray:
     """Return std, rate and mean of ln sigma, found by moments, in the coordinates of `_grid`."""
-    # The logarithm of the mean of m squares is 2 ln sigma plus an error that is independent from
-    # segment to segment, so the covariances at two lags give the variance and the rate.
+    # The logarithm of the mean of m squares is 2 ln sigma plus an error.  The errors of different
+    # segments are independent, so covariances at two lags give the variance and the rate.
     size, squares, sizes = _segments(view)
     log = 0.5 * np.log(np.maximum(squares / sizes, 1e-12))[:max(view.train.stop // size, 2)]
     c = log - log.mean()
@@ -123,7 +123,7 @@ def _start(view: View) -> FloatArray:
         return float(np.mean(c[lag:] * c[:-lag]))
 
     near = max(covariance(1), 1e-3)
-    # The lag at which the covariance has dropped clearly, which determines the rate best.
+    # The rate is determined best at a lag at which the covariance has dropped clearly.
     lags = [1 << k for k in range(1, 11) if 1 << k < c.size // 4]
     far = next((lag for lag in lags if covariance(lag) < 0.6 * near), lags[-1] if lags else 0)
     fall = math.log(near / max(covariance(far), 0.05 * near)) if far else 1.0
@@ -151,19 +151,20 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
 
 
 # Number of segments in a recording; number of levels of ln sigma, which extend to +-8 standard
-# deviations, because later samples may leave the fitted range; number of steps between
-# normalisations, small enough to avoid underflow.
+# deviations, because later samples may leave the fitted range; number of segments between
+# normalisations, which prevent underflow.
 _SEGMENTS = 1500
 _LEVELS = 65
 _EVERY = 4
-# Minimum relaxations of ln sigma in a recording: with 2, the logarithm of its variance has a
-# standard error of sqrt(2/2) = 1.
+# Minimum number of relaxation times of ln sigma in a recording: with 2, the standard error of the
+# logarithm of its variance is sqrt(2/2) = 1.
 _WANDERS = 2.0
 # Stationary probabilities of the levels.
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
 # Range of ln std, ln rate (1/s) and mean of ln sigma.
 _RANGE = np.array([[-4.0, -7.0, -math.inf], [1.0, 5.0, math.inf]])
-# Evaluations of a first fit and of a refit; probability below which a level is ignored.
+# Maximum number of evaluations in a first fit and in a refit; probability below which a level is
+# ignored.
 _EVALUATIONS = 60, 30
 _NOTICED = 1e-9
 
@@ -178,9 +179,9 @@ def _modes() -> FloatArray:
 
 def _kernels(keep: FloatArray) -> FloatArray:
     """Return the transition probabilities between levels, shape (rates, levels, levels)."""
-    # The levels are the sum of 64 two-state chains.  So conditional mean and variance equal the
-    # OU's, even if it is so slow that its steps are much smaller than the spacing of the levels
-    # (Rouwenhorst 1995; Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
+    # The levels are the sum of 64 two-state chains.  So their conditional mean and variance equal
+    # the OU's, even if the OU is so slow that its steps are much smaller than the spacing of the
+    # levels (Rouwenhorst 1995; Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
     modes, root = _modes(), np.sqrt(_STATIONARY)
     powers = keep[:, None] ** np.arange(_LEVELS - 1.0, -1.0, -1.0)
     chances = (modes * powers[:, None, :]) @ modes.T * (root / root[:, None])
@@ -191,7 +192,7 @@ def _kernels(keep: FloatArray) -> FloatArray:
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the levels' prior in each segment, its log density, and the levels, by point."""
+    """Return prior of the levels and log density in each segment, and the levels, by point."""
     reach = math.sqrt(_LEVELS - 1.0)
     std = np.exp(points[:, :1])
     levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
