@@ -1,1 +1,1 @@
-"""The ROS 2 nodes, executables and the live page; no other folder imports ROS."""
+"""The ROS 2 nodes, their executables, and the live page; no other folder imports ROS."""

@@ -16,11 +16,11 @@ _DESCRIBED = "'ros2 param describe' explains each parameter and gives its range"
 
 @dataclass(frozen=True)
 class Executable:
-    """Runs one node, and ends the process with its exit status."""
+    """Runs one node, then ends the process with an exit status."""
 
     node: str  # Name of the node
-    module: str  # Where its class is
-    kind: str  # Its class
+    module: str  # Module of its class
+    kind: str  # Name of its class
     about: str  # What --help prints
     managed: bool = False  # Whether it takes --lifecycle
 
@@ -63,7 +63,7 @@ Executable `adc`: the voltage of a Linux IIO or hwmon device -> ROS messages.
 
 ros2 run ou_monitor adc --ros-args -p device:=iio:device0 -p channel:=in_voltage0 -p gain:=11.0
 
-{_DESCRIBED}; doc/deploy.md says which devices there are.
+{_DESCRIBED}; doc/deploy.md describes the devices.
 """)
 
 supply_simulator = Executable('supply_simulator', 'supply_simulator_node', 'SupplySimulatorNode',
@@ -78,7 +78,7 @@ doc/simulation.md. {_DESCRIBED}.
 
 
 def replay() -> int:
-    """Publish a bag; the bag reader is imported here, because a Jazzy from apt alone lacks it."""
+    """Publish a bag; imported only here, because Jazzy from apt lacks the packages for bags."""
     from ou_monitor.nodes.replay import main
     return main()
 

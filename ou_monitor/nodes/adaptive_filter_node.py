@@ -3,16 +3,16 @@ The node `adaptive_filter`: low-pass a topic, with a cutoff that follows the noi
 
 doc/messages.md lists its topics:
 
-- `input`: a type of `filter_channels.CHANNELS`, or with `input.field` any installed type;
+- `input`: a type in `filter_channels.CHANNELS`, or with `input.field` any installed type;
 - `state` of the estimator, if published: sigma's error, alpha, throttle, and whether the
   estimate is usable;
 - `throttle` and `rpm`, if `notch.count` is above 0: for the notches, which come before the
   low-pass; without `throttle`, the throttle in `state` is used;
-- `~/output`: type, stamp and frame of the input; a derivative is a geometry_msgs/AccelStamped or
-  Vector3Stamped, or without a stamp a Float64.
+- `~/output`: has type, stamp and frame of the input, except that a derivative is a
+  geometry_msgs/AccelStamped or Vector3Stamped, or without a stamp a Float64.
 
 Limits: of an Imu only the angular velocity is filtered, of a BatteryState only the voltage, unless
-`input.field` names another field.  Other fields, covariances included, stay unchanged.
+`input.field` names another field.  All other fields, including covariances, are copied unchanged.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, Sta
 from ou_monitor.records import Level, NAN, Status
 from std_msgs.msg import Float64
 
-# Cannot be changed at run time: the mode decides the unit of the output.
+# Not changeable at run time, because the mode determines the unit of the output.
 _MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
 INPUT_PARAMETERS = (
     Parameter('input.type', AUTO, "Message type of `input`; auto: the publisher's type."),
@@ -47,7 +47,7 @@ INPUT_PARAMETERS = (
 # Fields of the state that the filter uses.
 _FIELDS = ('sigma_se', 'alpha', 'throttle', 'load_noise')
 _UNKNOWN = [NAN] * len(_FIELDS)
-# Ratio of sigma's window to the sliding window above which sigma is from a longer fit.
+# Ratio of sigma's window to the sliding window above which sigma comes from a longer fit.
 _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
@@ -61,12 +61,12 @@ class SupplyEstimate(NamedTuple):
     alpha: float = NAN  # Relaxation rate, 1/s; NaN: unknown
     throttle: float = NAN  # Throttle, 0..1; NaN: unknown
     why: str = ''  # Why sigma is unknown; empty when it is valid
-    # 'relaxation': the estimator's sigma; 'load': the noise not explained by the load; 'none'.
+    # 'relaxation': the estimator's sigma; 'load': the load model's noise; 'none'.
     source: str = 'none'
 
 
 class SupplyInput:
-    """Newest `sigma` and `state`, each dropped when stale (`now`: monotonic, s)."""
+    """Newest `sigma` and `state`; each is dropped when stale (`now`: monotonic clock, s)."""
 
     def __init__(self, now: Callable[[], float], topic: str) -> None:
         self._topic = topic
@@ -76,27 +76,27 @@ class SupplyInput:
         self._values = _UNKNOWN
 
     def take_sigma(self, value: float) -> None:
-        """Take a sigma, V/sqrt(s); a negative one counts as unknown."""
+        """Take a sigma, V/sqrt(s); negative values count as unknown."""
         self.sigma_silence.record()
         self._sigma = value if value >= 0.0 and math.isfinite(value) else NAN
 
     def take_state(self, message: Any) -> None:
-        """Take a DiagnosticArray of the estimator; ignore others on the topic."""
+        """Take a DiagnosticArray of the estimator; ignore messages of other nodes."""
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             if 'sigma_se' in values:
                 self.state_silence.record()
                 self._state = values
-                # The error is of ln sigma, as `AdaptiveLowPass` takes it.
+                # The error refers to ln sigma, as `AdaptiveLowPass` expects.
                 error, *others = (_number(values, key) for key in _FIELDS)
                 self._values = [error if error >= 0.0 else NAN, *others]
                 return
 
     def now(self, stale_after: float, rate: float = NAN) -> SupplyEstimate:
         """Return the latest values that are not older than `stale_after`, s."""
-        # Without a sigma, derive it from the noise that the load does not explain at the present
-        # throttle, as the sigma of an OU with relaxation `rate`, 1/s. This sigma includes the
-        # ADC's white noise, so it is never below the supply's own.
+        # If sigma is unknown, take the sigma of an OU with relaxation `rate`, 1/s, and the rms of
+        # the load model's noise at the present throttle.  This sigma includes the white noise of
+        # the ADC, so it is not below the supply's own sigma.
         fresh = within(self.state_silence.age, stale_after)
         error, alpha, throttle, noise = self._values if fresh else _UNKNOWN
         why = self._why_no_sigma(fresh, stale_after)
@@ -119,7 +119,7 @@ class SupplyInput:
             return f'the estimator reports {status}'
         window = _number(self._state, 'window_s')
         if fresh and window > _LONGER * _number(self._state, 'duration'):
-            # An average over a long window does not follow the throttle.
+            # An average over a long window does not follow throttle.
             return f'sigma is an average over the last {window:g} s, too long for the filter'
         return ''
 
@@ -132,7 +132,7 @@ def _number(values: dict[str, str], key: str) -> float:
 
 
 class MotorInputs:
-    """Newest throttle, and the motor speeds since the last call; times are monotonic, s."""
+    """Newest throttle, and motor speeds not taken yet (`now`: monotonic clock, s)."""
 
     def __init__(self, node: MonitorNode, values: Mapping[str, Any],
                  now: Callable[[], float]) -> None:
@@ -143,11 +143,11 @@ class MotorInputs:
         self.sources = SourceFinder(node, tuple(self.silence), values, self._open)
 
     def throttle(self, stale_after: float) -> float:
-        """Return the throttle, 0..1; NaN when the last is older than `stale_after`, s."""
+        """Return the throttle, 0..1; NaN if the newest is older than `stale_after`, s."""
         return self._throttle if within(self.silence['throttle'].age, stale_after) else NAN
 
     def take_speeds(self) -> list[float]:
-        """Return the motor speeds received since the last call; empty: none."""
+        """Return the motor speeds received since the last call; empty if there are none."""
         speeds, self._speeds = self._speeds, []
         return speeds
 
@@ -212,7 +212,7 @@ class AdaptiveFilterNode(MonitorNode):
         NotchSettings.from_options(notch_options(values))
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Bring checked parameters into force; the output does not jump."""
+        """Apply checked parameters; the output does not jump."""
         super().apply(values)
         for channel in (self._idle, *self._filters):
             channel.configure(**_filter_options(values))
@@ -220,13 +220,13 @@ class AdaptiveFilterNode(MonitorNode):
 
     @property
     def low_pass(self) -> AdaptiveLowPass:
-        """Filter of the first signal: all have one cutoff."""
+        """Filter of the first signal; all signals have the same cutoff."""
         return self._filters[0] if self._filters else self._idle
 
     # -- messages in
 
     def _watch(self) -> None:
-        """Subscribe as soon as a publisher shows the type."""
+        """Subscribe to the input as soon as its type is known from a publisher."""
         self._stamper.follow()
         if self._notch.settings.count:
             self._motors.sources.watch()
@@ -280,7 +280,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _apply_notches(self, stamp: float, values: Sequence[float], supply: SupplyEstimate
                        ) -> Sequence[float]:
-        """Return the signals after the notches; in shadow mode unchanged."""
+        """Return the signals after the notches; unchanged in shadow mode."""
         if not self._notch.settings.count and not self._notch.active:
             return values
         throttle = self._motors.throttle(self.low_pass.settings.stale_after)
@@ -301,7 +301,7 @@ class AdaptiveFilterNode(MonitorNode):
                                 self.low_pass.settings.alpha)
 
     def _jumped(self, reason: str) -> None:
-        """Keep the output: a step back in time counts as a step of length 0."""
+        """Keep the output, because the filter ignores a step back in time."""
         self.get_logger().info(f'{reason}: the filter continues from its output')
 
     # -- reporting
@@ -398,7 +398,7 @@ class AdaptiveFilterNode(MonitorNode):
 
 
 def _unknown(supply: SupplyEstimate) -> str:
-    """Return why sigma is unknown."""
+    """Return why sigma is unknown, as a clause."""
     return supply.why or 'sigma was not known at the last message'
 
 

@@ -1,14 +1,14 @@
 """
 The node `adc`: publish the voltage of a Linux IIO or hwmon device.
 
-A thread reads an IIO device with a buffer in blocks and publishes them on `voltage` as
-sensor_msgs/JointState, which has a header and an array: `position` holds the samples, V, and the
-stamp is the kernel's time of the last one.  msg_config `adc` reads these messages.  hwmon devices,
-and IIO devices without a buffer, are polled; each sample is a sensor_msgs/BatteryState, stamped
-when polled.  `/diagnostics` at 1 Hz.
+A thread reads an IIO device with a buffer in blocks, and publishes each block on `voltage` as a
+sensor_msgs/JointState, because that has a header and an array: `position` contains the samples, V,
+and the stamp is the kernel's time of the last sample.  msg_config `adc` describes these messages.
+hwmon devices, and IIO devices without a buffer, are polled; each sample is a
+sensor_msgs/BatteryState, stamped when polled.
 
-Limits: one channel.  Blocks carry kernel stamps only with a timestamp channel; a gap in these
-stamps splits a block, so that the estimator detects the gap.
+Limits: one channel.  Blocks have kernel stamps only if the device has a timestamp channel; a gap
+in these stamps splits a block, so that the estimator detects the gap.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ADC_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sysfs', '/sys', 'Path of sysfs.'),
     Parameter('dev', '/dev', 'Path of the character devices.'),
 )
-# Silence after which the device is reported silent, s.
+# Time without samples after which the device is reported as silent, s.
 SILENT = 1.0
 
 
@@ -97,7 +97,7 @@ class AdcNode(MonitorNode):
     def _publish(self, message: Any, block: Block) -> None:
         message.header.stamp = to_time(block.stamp)
         volts = block.volts * self._gain + self._shift
-        # The message takes over an array as it is, but checks each number of a list.
+        # Assign an array, because the message would check each number of a list.
         message.position = array('d', volts.tobytes())
         self._output.publish(message)
         self._samples += volts.size
@@ -114,7 +114,7 @@ class AdcNode(MonitorNode):
             self._output.publish(message)
             self._samples += 1
             self._silence.record()
-            # Missed polls are skipped.
+            # Skip missed polls.
             due = max(due + 1.0 / self.rate, time.monotonic())
 
     def _diagnose(self) -> None:

@@ -1,7 +1,8 @@
 """
-Base of the nodes: parameters from tables, start and end, a thread, and diagnostics.
+Base class of the nodes: parameters from tables, start and stop, a thread, and diagnostics.
 
-Each name and default exists once, in a table. An exception in a callback does not end a node.
+The name and default of each parameter are defined once, in a table.  An exception in a callback
+does not end a node.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ LOCK = Parameter(
     'lock_parameters', False,
     'Whether to refuse what can disarm the node at run time: changes of any parameter except '
     'publish_rate, and the services ~/clear_brownout and ~/save_model.')
-# Busy wait at the end of a sleep, s: the usual lateness of `sleep`.  With it, a 1 kHz bag costs a
+# Busy wait at the end of a sleep, s: the usual lateness of `sleep`.  For a 1 kHz bag, it takes a
 # tenth of a core.
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05
-# Maximum time for which a second thread may hold the interpreter, s: with Python's default of 5 ms
-# each call of the executor, or each message of a replay, may wait that long.
+# Maximum time for which a second thread may hold the interpreter, s.  With Python's default, each
+# call of the executor, or each message of a replay, may wait for 5 ms.
 SWITCH = 2e-4
 # Time for which the diagnostics report an exception of a callback, s.
 TELL = 10.0
@@ -56,11 +57,11 @@ PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are publis
 
 
 class MonitorNode(Node):
-    """Node whose parameters come from tables; a managed one begins when it is activated."""
+    """Node whose parameters come from tables; a managed node begins when it is activated."""
 
-    # Changes of `RUN_TIME` parameters are checked together (`check` raises `ValueError`, and the
-    # old values stay), then given to `apply`, which must keep all state. `FIXED` ones are read at
-    # the start.
+    # Changes of `RUN_TIME` parameters are checked together (if `check` raises `ValueError`, the
+    # old values stay), then passed to `apply`, which must keep all state.  `FIXED` parameters are
+    # read at the start.
 
     RUN_TIME: ClassVar[tuple[Parameter, ...]] = ()
     FIXED: ClassVar[tuple[Parameter, ...]] = ()
@@ -74,7 +75,7 @@ class MonitorNode(Node):
         self._at_stop: list[Callable[[], object]] = []
         self.faults, self.fault = 0, ''
         self._faulted = -math.inf
-        # Error that ended the thread's work; '' if none.
+        # Error that ended the work of the thread; empty if there was none.
         self.problem = ''
         self.ending = Event()
         self._thread: Thread | None = None
@@ -121,7 +122,7 @@ class MonitorNode(Node):
         self.running = False
         self.ending.set()
         if self._thread is not None:
-            # Before the publishers are closed.
+            # The thread must end before the publishers are closed.
             self._thread.join(2.0)
         for made in reversed(self._made):
             for destroy in (self.destroy_timer, self.destroy_subscription, self.destroy_service,
@@ -139,7 +140,7 @@ class MonitorNode(Node):
             try:
                 work()
             except Exception as error:
-                # Publishing after a shutdown is not a failure.
+                # Errors of publishing after a shutdown are ignored.
                 if not self.ending.is_set() and self.context.ok():
                     self.problem = str(error) if isinstance(error, InputError) else (
                         f'{type(error).__name__}: {error}')
@@ -165,15 +166,15 @@ class MonitorNode(Node):
         """Raise `ValueError` when the parameters contradict each other."""
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Bring checked parameters into force without losing state."""
+        """Apply checked parameters without losing state."""
         if self._publishing is not None and self._outputs_callback is not None and (
                 self._publishing.timer_period_ns != round(1e9 / values[PUBLISH_RATE.name])):
-            # A timer applies a new period only after the old one has ended.
+            # A timer would apply a new period only at the end of the present one.
             self.destroy_timer(self._publishing)
             self.publish_every(self._outputs_callback)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Call back every `period` s of real time, to detect silence under simulated time too."""
+        """Call back every `period` s of real time, even on simulated time, to detect silence."""
         timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
         self._made.append(timer)
         return timer
@@ -191,7 +192,7 @@ class MonitorNode(Node):
             try:
                 return callback(*args)
             except Exception as error:
-                # After a shutdown by signal the publishers are closed: not a failure.
+                # After a shutdown by a signal the publishers are closed: ignore the error.
                 if self.context.ok():
                     self._take_fault(error)
         return call
@@ -205,7 +206,7 @@ class MonitorNode(Node):
         self.recover(error)
 
     def recover(self, error: Exception) -> None:
-        """Restart work that a failed callback may have left unfinished."""
+        """Restart work that a failed callback may have left unfinished; by default, nothing."""
 
     @property
     def fault_notes(self) -> list[str]:
@@ -216,7 +217,7 @@ class MonitorNode(Node):
     def status(self, part: str, level: Level, summary: str, fields: Mapping[str, object],
                stamp: float, hardware_id: str) -> DiagnosticArray:
         """Return the status of a part of the node as a stamped message (stamp in s)."""
-        # Floats keep all their digits.
+        # `repr` keeps all digits of a float.
         message = DiagnosticArray()
         message.header.stamp = to_time(stamp)
         message.status = [DiagnosticStatus(
@@ -268,15 +269,15 @@ class MonitorNode(Node):
 
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
         """Return a subscription whose messages wait in the middleware until they are taken."""
-        # The queue of the EventsExecutor has no bound, and messages in it delay every timer.
-        # rclpy requires a callback here too.
+        # The queue of the EventsExecutor is unbounded, and messages in it delay every timer.
+        # rclpy requires a callback, although it is never called.
         polled = self.create_subscription(kind, topic, lambda message: None, qos, raw=True)
         self._polled.append(polled)
         return polled
 
     def with_info(self, callback: Callable[[Any, Any], None]) -> Callable[..., Any]:
-        """Return a subscription callback of (message, info), guarded, for every executor."""
-        # rclpy 7.1's EventsExecutor passes one tuple where the other executors pass two arguments.
+        """Return a guarded subscription callback of (message, info) that suits every executor."""
+        # The EventsExecutor of rclpy 7.1 passes one tuple, other executors pass two arguments.
         inner = self.guarded(callback)
 
         def call(*args: Any) -> None:
@@ -284,7 +285,7 @@ class MonitorNode(Node):
         call.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
         return call
 
-    # Monotonic time, s, which measures silence (the wall clock may jump).
+    # Monotonic time, s, for measuring silence, because the wall clock may jump.
     steady_now = staticmethod(time.monotonic)
 
     def stamp_now(self) -> float:
@@ -292,7 +293,7 @@ class MonitorNode(Node):
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
     def _widen(self, parameters: list[RosParameter]) -> list[RosParameter]:
-        """Read 2 as 2.0 where a parameter is a float: YAML writes such numbers without a point."""
+        """Turn integers into floats for float parameters, because YAML files may say 2 for 2.0."""
         return [RosParameter(p.name, RosParameter.Type.DOUBLE, float(p.value))
                 if p.name in self._floats and p.type_ is RosParameter.Type.INTEGER else p
                 for p in parameters]
@@ -346,8 +347,8 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
 
 def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
     """Return the unconfigured managed version of a kind of node (design.ros2.org)."""
-    # Before it is active it has parameters and lifecycle services only.  After a failure it stays
-    # in its former state.
+    # Before the node is active, it has only parameters and lifecycle services.  After a failed
+    # transition, it stays in its former state.
     class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]
         """A node that begins and ends its work by lifecycle transitions."""
 
@@ -358,7 +359,8 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             original = change.callback
 
             def answer(request: Any, response: Any) -> Any:
-                # rclpy 7.1 raises if a state has no such transition, which would end the node.
+                # rclpy 7.1 raises an exception for an impossible transition, which would end the
+                # node.
                 try:
                     return original(request, response)
                 except Exception as error:
@@ -387,7 +389,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             return self._done('reset', self.stop)
 
         def _done(self, what: str, work: Callable[[], Any]) -> TransitionCallbackReturn:
-            # rclpy would report an exception without its message.
+            # rclpy would report an exception without its message, so report it here.
             try:
                 work()
             except InputError as error:
@@ -402,7 +404,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
 
 
 def wait_until(instant: float, going: Callable[[], bool]) -> bool:
-    """Wait until `time.monotonic()` reaches an instant (instant in s)."""
+    """Wait until `time.monotonic()` reaches an instant, s; return False once not `going()`."""
     while True:
         if not going():
             return False
@@ -416,14 +418,13 @@ def wait_until(instant: float, going: Callable[[], bool]) -> bool:
 
 
 def battery(location: str = '') -> BatteryState:
-    """Return a BatteryState whose values, except the voltage to be set, are unknown (NaN)."""
+    """Return a BatteryState for setting a voltage; all other values are unknown (NaN)."""
     nan = math.nan
     return BatteryState(current=nan, charge=nan, capacity=nan, design_capacity=nan, percentage=nan,
                         temperature=nan, present=True, location=location)
 
 
 def to_time(stamp: float) -> object:
-    """Return builtin_interfaces/Time of a stamp in s; 0 when there is none."""
-    # The comparison is false for NaN too.
+    """Return the builtin_interfaces/Time of a stamp, s; 0 if the stamp is NaN or out of range."""
     nanoseconds = round(stamp * 1e9) if 0.0 <= stamp < 2.0 ** 31 else 0
     return Time(nanoseconds=nanoseconds).to_msg()

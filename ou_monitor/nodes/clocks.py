@@ -1,24 +1,24 @@
 """
 Times of messages without a stamp: sampling time from sending time, and simulated time.
 
-`SendClock`: a message without a stamp has only its source timestamp.  A driver samples by a timer,
-but the scheduler delays its sending: after a pause of 10 ms, ten messages leave within 0.2 ms, and
-a change over 1 ms seems to take 20 us.  If 0.5 % of the intervals are like this, sigma doubles.
-The samples of a steady source are therefore put on an even time line that slowly follows the
-source timestamps.
+`SendClock`: a message without a stamp has only its source timestamp, i.e. its sending time.  A
+driver samples by a timer, but the scheduler may delay the sending: after a pause of 10 ms, ten
+messages of a 1 kHz source leave within 0.2 ms, and a change over 1 ms seems to take 20 us.  If
+0.5 % of the intervals are like this, sigma doubles.  The samples of a steady source are therefore
+put on an even time line that slowly follows the source timestamps.
 
-A steady source can be late, but not early: the lower convex hull of source timestamp against
-message number is a straight line with the period as its slope, and many messages lie near it (this
-separates clock skew from delays: Zhang, Liu & Xia 2002, "Clock synchronization algorithms for
-network measurements"). At any sampling rate the hull must span many pauses, because a burst of 400
-messages sent 10 us apart is a straight line too.
+A message of a steady source can be late, but not early: the lower convex hull of source timestamp
+against message number is a straight line with the period as its slope, and many messages lie near
+it (this separates clock skew from delays: Zhang, Liu & Xia 2002, "Clock synchronization algorithms
+for network measurements").  At any sampling rate, the hull must span many pauses, because a burst
+of 400 messages sent 10 us apart is a straight line too.
 
-Limits: a constant delay stays.  The times of an unsteady source are not changed; if its intervals
-cannot be sampling intervals, as when a driver empties a buffer, `in_bursts` is true.
+Limits: a constant delay remains.  The times of an unsteady source are not changed; if its
+intervals cannot be sampling intervals, as when a driver empties a buffer, `in_bursts` is true.
 
 `SimClockMap`: the middleware stamps every message with the wall clock of its sender.  If a bag is
 replayed at four times its speed, these stamps are four times too close, and alpha would be four
-times too large.  Messages on `/clock` have both times and so give the map between them.
+times too large.  Messages on `/clock` have both times, and thus determine the map between them.
 """
 
 from __future__ import annotations
@@ -36,45 +36,46 @@ from ou_monitor.records import FloatArray
 KEEP, SPAN = 400, 1.0
 # Maximum number of messages examined: one second at 30 kHz.
 MOST = 30_000
-# Minimum messages and time, s, of the first judgement: pauses of 50 ms followed by bursts tilt a
-# line over 0.2 s by at most a quarter.
+# Minimum number of messages, and minimum time, s, for the first judgement: over 0.2 s, pauses of
+# 50 ms followed by bursts tilt the line by at most a quarter.
 LEAST, FIRST_SPAN = 200, 0.2
-# Messages and seconds between judgements (a judgement takes 0.2 ms for 400 messages, 0.6 ms for
-# 10 000).
+# Minimum number of messages, and minimum time, s, between judgements (a judgement takes 0.2 ms for
+# 400 messages, and 0.6 ms for 10 000).
 JUDGE, JUDGE_SPAN = 100, 0.1
-# A message is near the line within NEAR sqrt(n) periods, n the messages examined: a source without
-# a timer drifts from its line as sqrt(n), so its share of near messages does not depend on n.
-# Measured: at most 14 % of a Poisson source is near (99th percentile, n = 200; 12 % from 400 on),
-# 23 % or more of a 10 kHz timer whose process pauses 30 times a second for 5..50 ms, 21 % when one
+# Maximum distance of a near message from the line, in sqrt(n) periods, where n is the number of
+# messages examined, and minimum share of near messages from a steady source.  A source without a
+# timer drifts from its line as sqrt(n), so its share of near messages does not depend on n.
+# Measured shares: Poisson source, at most 14 % (99th percentile, n = 200; 12 % from 400 on);
+# 10 kHz timer whose process pauses 30 times a second for 5..50 ms, at least 23 %, or 21 % if one
 # message in a hundred is also lost.
 NEAR, ON_LINE = 0.1, 0.2
-# A source sends in bursts when half of its intervals are below this fraction of their mean (for a
-# Poisson source: below 0.69).
+# A source sends in bursts if half of its intervals are below this fraction of their mean (of a
+# Poisson source, half are below 0.69).
 SHORT = 0.25
-# Minimum messages of a burst before a gap.
+# Minimum number of messages in a burst before a gap.
 LUMP = 8
 IN_BURSTS = (
     'The messages come in bursts without stamps, and no steady source was detected behind '
     'them, so nothing can be estimated: stamp them in the driver, or send blocks of samples '
     'with adc.sample_rate.')
-# The line follows the source with this time constant, s: a delay that grows to 50 ms and vanishes
-# within 50 ms moves it by 1.2 ms.
+# Time constant with which the time line follows the source, s: a delay that grows to 50 ms and
+# vanishes within 50 ms shifts the time line by 1.2 ms.
 FOLLOW = 1.0
 # Minimum gap, as opposed to a delay, s; minimum step back of a clock, s.
 GAP, BACK = 0.25, 0.5
-# Maximum points of the hull; with more messages, the lowest of each group is used.
+# Maximum number of points for the hull; of more messages, the earliest of each group is used.
 _POINTS = 400
 
 
 def line_under(times: Sequence[float] | FloatArray) -> tuple[float, float]:
-    """Return the period of a source, and how steady it is (times in s)."""
+    """Return a source's period, s, and the share of its messages near the line (times in s)."""
     stamps = np.asarray(times, dtype=np.float64)
     stamps = stamps - stamps[0]
     n = stamps.size
     numbers = np.arange(n)
     group = -(-n // _POINTS)
     at, period = 0, float(stamps[-1]) / (n - 1)
-    # Which message of a group is the lowest depends on the slope: three rounds settle it.
+    # Which message of a group is the earliest depends on the slope; three rounds suffice.
     for _ in range(3 if group > 1 else 1):
         lowest = numbers
         if group > 1:
@@ -91,7 +92,7 @@ def line_under(times: Sequence[float] | FloatArray) -> tuple[float, float]:
 
 def _hull_edge(numbers: list[int], times: list[float]) -> tuple[int, float]:
     """Return where the middle edge of the lower convex hull starts, and its slope."""
-    # The middle in time: a burst holds many messages but takes hardly any time.
+    # Take the middle in time, because a burst has many messages but takes hardly any time.
     hull: list[tuple[int, float]] = []
     for k, time in zip(numbers, times):
         while len(hull) >= 2:
@@ -110,8 +111,8 @@ class SendClock:
     """Turn source timestamps of single samples into stamps."""
 
     def __init__(self) -> None:
-        # Whether no steady source is detectable, so that the times are unusable; and how often
-        # this has ended.
+        # Whether times are unusable, because messages come in bursts and no steady source is
+        # detected; and how often this has ended.
         self.in_bursts = False
         self.settled = 0
         self._lumps = 0
@@ -151,7 +152,7 @@ class SendClock:
 
     @property
     def _gap(self) -> float:
-        # An interval of a slow source is not a gap.
+        # A gap is longer than the intervals of a slow source.
         return GAP if math.isnan(self._period) else max(GAP, 5.0 * self._period)
 
     def _judge(self) -> None:
@@ -194,14 +195,14 @@ class SendClock:
         return expected - math.expm1(-self._period / FOLLOW) * error
 
 
-# Pairs fitted: half a second at the usual 100 Hz averages the jitter of single publications, and
-# still follows a change of the replay rate within half a second.
+# Number of pairs fitted: half a second at the usual 100 Hz, which averages the jitter of single
+# publications, and follows a change of the replay rate within half a second.
 PAIRS = 50
-# A clock that is off the line by more than this, s of the sender's time, has jumped (next pass of
-# a bag, seek): no publication is that late.
+# Deviation from the line, s of the sender's time, above which the clock has jumped (next pass of a
+# bag, seek), because no publication is that late.
 STEP = 0.25
-# A clock silent for this time, s of the sender's clock, and this number of its own intervals, has
-# stopped: later messages have no simulated time.
+# Silence after which the clock has stopped, so that later messages have no simulated time: s of
+# the sender's time, and number of the clock's intervals (the longer of both).
 STOPPED, MISSED = 1.0, 5.0
 
 
@@ -225,7 +226,7 @@ class SimClockMap:
         return max(STOPPED, MISSED * span / max(len(self._pairs) - 1, 1))
 
     def add(self, source: float, clock: float) -> bool:
-        """Take one message of `/clock` (source in s, clock in s)."""
+        """Take a message of `/clock`, both times in s; return whether the clock has jumped."""
         stepped = False
         if self._pairs:
             last_source, last_clock = self._pairs[-1]
@@ -238,7 +239,7 @@ class SimClockMap:
                 return False
         self._pairs.append((source, clock))
         if self.ready:
-            # Relative to the first pair, so that nanoseconds survive in floats.
+            # Fit relative to the first pair, so that floats resolve nanoseconds.
             first_source, first_clock = self._pairs[0]
             self._rate, self._off = linear_regression(
                 *zip(*((x - first_source, y - first_clock) for x, y in self._pairs)))
@@ -246,7 +247,7 @@ class SimClockMap:
 
     def __call__(self, source: float) -> float:
         """Return the simulated time, s, at which a message was sent; NaN while undefined."""
-        # The line is continued between pairs and shortly after the last one.
+        # The line is used between pairs, and for a short time after the last pair.
         if not self.ready or source - self._pairs[-1][0] > self.patience:
             return math.nan
         return self._line(source)

@@ -1,14 +1,14 @@
 """
 The node `estimator`: voltage and throttle -> OU estimate, brown-out risk and flag.
 
-doc/messages.md lists its topics, services and fields.  Inputs are best effort; outputs, at
-`publish_rate` of real time, are reliable.  `~/brownout` is published only while it is known, so
-that it is never silently false.  Messages wait in the middleware, which keeps the newest 2000, and
-are fetched 50 times a second and read before each report, so that a flood of messages does not
-delay an output.  Hold, delay and latch run in real time, even under `use_sim_time`.
+doc/messages.md lists its topics, services and fields.  Inputs are best effort; outputs are
+reliable, at `publish_rate` in real time.  `~/brownout` is published only while the flag is known,
+so that it is never false by mistake.  Messages wait in the middleware, which keeps the newest
+2000, and are fetched 50 times a second and read before each report, so that a flood of messages
+does not delay an output.  Hold, delay and latch run in real time, even under `use_sim_time`.
 
-Limits: one voltage; the values of an estimate older than `stale_after` are published as NaN,
-though `~/state` still shows them.
+Limits: one voltage.  The values of an estimate older than `stale_after` are published as NaN, but
+`~/state` still shows them.
 """
 
 from __future__ import annotations
@@ -41,23 +41,24 @@ from std_msgs.msg import Bool, Float64
 
 # Period of fetching the waiting messages, s, whatever `publish_rate` is.
 POLL = 0.02
-# Maximum time between two transfers of fetched messages to the monitor, s; each report makes one
-# too. A transfer takes 2 to 3 ms of CPU, however few samples there are.
+# Maximum time between two transfers of fetched messages to the monitor, s; each report makes a
+# transfer too.  A transfer takes 2 to 3 ms of CPU, however few the samples.
 HAND_OVER = 0.25
-# Maximum share of the time that estimates take; to keep it, estimates become less frequent, and if
-# pushing the samples alone exceeds it, samples are thinned.
+# Maximum share of CPU time.  To stay below it, estimates are made less often, and if pushing the
+# samples alone exceeds it, samples are thinned.
 SHARE = 0.25
-# An estimate that takes longer than this, s of CPU, is not made for every report.
+# CPU time of an estimate, s, above which it is not repeated for every report.
 HEAVY = 0.02
-# Maximum thinning: one sample in this many is kept.
+# Maximum factor by which samples are thinned.
 MOST_THIN = 1024
-# Maximum throttle messages placed among the voltages at each hand-over, evenly chosen.
+# Maximum number of throttle messages that are placed among the voltages in one transfer; of more,
+# an even selection is used.
 MOST_THROTTLES = 100
 STATE_FILE = Parameter(
     'state_file', '',
     'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
     "after the node; relative: under ROS's log directory); empty: off.")
-# Throttle above which the craft may be flying.
+# Throttle above which the craft may be in flight.
 LANDED = 0.05
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 
@@ -87,8 +88,8 @@ class EstimatorNode(MonitorNode):
         self._watched = PublisherWatch(self)
         self._settled = 0
         self._console = Console(self)
-        # When the next estimate is due, and the times of the last outputs, s; below, CPU time of
-        # pushing samples, s, and the time since which it is counted.
+        # Times at which the next estimate is due, and at which outputs were last published, s;
+        # below: CPU time of pushing samples, s, and the time since which it is counted.
         self._due = self._published = self._diagnosed = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
         self._handed_over = -math.inf
@@ -113,7 +114,7 @@ class EstimatorNode(MonitorNode):
             return None
         latch = LatchFile(Path(get_logging_directory()) / Path(name).expanduser(),
                           self.get_fully_qualified_name())
-        # Wait for the write in progress.
+        # At the stop, finish a write in progress.
         self.at_stop(latch.close)
         reason = latch.read()
         if latch.problem:
@@ -126,7 +127,7 @@ class EstimatorNode(MonitorNode):
         return latch
 
     def recover(self, error: Exception) -> None:
-        """Restart the monitor, without the data so far, after a callback has raised."""
+        """Restart the monitor without the data so far, after an exception in a callback."""
         if self.running:
             self._monitor.restart(error)
 
@@ -147,13 +148,13 @@ class EstimatorNode(MonitorNode):
             self._diagnose()
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Bring checked parameters into force; no sample in the window is lost."""
+        """Apply checked parameters; no sample in the window is lost."""
         super().apply(values)
         settings = _settings(values)
         self._monitor.configure(settings)
         self._monitor.set_model(self._models.use(settings.model_file))
 
-    # -- where the input comes from
+    # -- sources of the input
 
     def _watch(self) -> None:
         """Check the publishers, 5 times a second."""
@@ -183,7 +184,8 @@ class EstimatorNode(MonitorNode):
         for each in self._inputs.values():
             each.fetch()
         now = self.steady_now()
-        # On simulated time a message counts as received when it is read.
+        # On simulated time there is no delay, because a message counts as received when it is
+        # read.
         if now - self._handed_over < most and not self._stamper.simulated and not any(
                 each.full for each in self._inputs.values()):
             return
@@ -199,7 +201,7 @@ class EstimatorNode(MonitorNode):
         self._thin_if_costly(time.thread_time() - pushing)
 
     def _merge(self, voltage: Arrivals | None, throttle: Arrivals) -> Arrivals | None:
-        """Place throttle messages among voltages, by arrival; return the remaining voltages."""
+        """Place throttle messages among voltages by arrival; return the remaining voltages."""
         times = self._times(throttle)
         column = throttle.column
         for k in range(0, column.n, -(-column.n // MOST_THROTTLES)):
@@ -219,7 +221,7 @@ class EstimatorNode(MonitorNode):
         self._arrived.record(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
         if self._send_clock is not None and self._send_clock.settled > self._settled:
-            # Earlier messages, perhaps also some of this poll, have times of another clock.
+            # Earlier messages, perhaps also some of this poll, have times on another time line.
             self._settled = self._send_clock.settled
             self._stream.reset('a steady source was found behind messages in bursts')
             ends = np.full(ends.size, math.nan)
@@ -227,14 +229,14 @@ class EstimatorNode(MonitorNode):
             ends, column.stamped, column.counts, column.values, messages.arrived,
             column.beside)
         if held.any():
-            # On simulated time they arrived at some time between two polls: use now.
+            # On simulated time the arrival time is unknown, so use the present time.
             received = (np.full(ends.size, self.stamp_now()) if self._stamper.simulated
                         else messages.received)
             self._usable.record(messages.arrived[held].item(-1))
             self._source_clock.take(ends[held], received[held], messages.arrived[held].item(-1))
 
     def _times(self, messages: Arrivals, smooth: SendClock | None = None) -> FloatArray:
-        """Return the times of messages, s; the sending times for those without a stamp."""
+        """Return the times of messages, s: stamps, or sending times where there is no stamp."""
         column = messages.column
         if column.stamped.all():
             return column.stamp
@@ -243,7 +245,7 @@ class EstimatorNode(MonitorNode):
             for end, own in zip(column.stamp.tolist(), column.stamped.tolist())])
 
     def _thin_if_costly(self, pushed: float) -> None:
-        """Thin the samples if taking them costs too much (pushed: s of CPU)."""
+        """Thin the samples if pushing them costs too much (pushed: CPU time, s)."""
         self._load += pushed
         now = self.steady_now()
         if now - self._loaded < 1.0:
@@ -257,7 +259,7 @@ class EstimatorNode(MonitorNode):
             stream.thin //= 2
 
     def _watch_throttle(self) -> None:
-        # Allow for three missed messages of a slow source.
+        # A slow source may miss three messages.
         limit = 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
         age = self._throttle_silence.age
         if age is not None and age > limit and not math.isnan(self._stream.throttle):
@@ -278,7 +280,7 @@ class EstimatorNode(MonitorNode):
         return done
 
     def _save_model(self) -> str:
-        """Write what this flight has learned into `model_file`, once it has landed."""
+        """Write the load model learned in this flight into `model_file`, after landing."""
         loads, model = self._monitor.load_filter, self._monitor.model
         learned = loads.learned()
         if self.locked:
@@ -312,7 +314,7 @@ class EstimatorNode(MonitorNode):
         report = self._monitor.report(
             self._source_clock.age(now), now, self._usable.age, again=again)
         if again:
-            # An estimate of 1 ms at 10 Hz is a small load; one of 100 ms delays the next.
+            # An estimate that takes 1 ms is a small load at 10 Hz; 100 ms delay the next estimate.
             took = time.thread_time() - begin
             self._due = now + (took / SHARE if took > HEAVY else 0.0)
         self._console.flag(report.flag)
@@ -324,7 +326,7 @@ class EstimatorNode(MonitorNode):
         limit = max(self._monitor.settings.stale_after, report.patience)
         silent = not report.fresh
         if level is Level.ERROR:
-            # An active flag comes before problems of the input.
+            # The active flag is reported before problems of the input.
             summary = f'{summary} {problem}' if problem else summary
         elif problem:
             level, summary = (Level.ERROR if silent else Level.WARN), problem
@@ -340,12 +342,12 @@ class EstimatorNode(MonitorNode):
             summary = ' '.join((summary, *notes))
             level = max(level, Level.WARN) if level is not Level.STALE else level
         if self._latch is not None and self._latch.problem:
-            # Report a failing latch file even if the input is bad: the user relies on the latch.
+            # Report a problem of the latch file in any case, because the user relies on the latch.
             level, summary = Level.ERROR, f'{summary} {self._latch.problem}.'
         return report, level, summary
 
     def _notes(self) -> list[str]:
-        """Return the notes on the input that apply in every state."""
+        """Return the notes that are added to any summary."""
         notes = []
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples enters the estimate; the '
@@ -365,7 +367,7 @@ class EstimatorNode(MonitorNode):
 
     @property
     def _voltage(self) -> Source:
-        """Return the topic of the voltage, present or awaited."""
+        """Return the source of the voltage, opened or awaited."""
         return self._sources.opened.get('voltage', self._sources.sources['voltage'])
 
     @property
@@ -379,7 +381,7 @@ class EstimatorNode(MonitorNode):
                   'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
                   'throttle_budget': report.budget}
         for key, output in self._outputs.items():
-            # Stale values are published as unknown.
+            # Publish stale values as unknown.
             output.publish(Float64(data=values[key] if report.fresh else math.nan))
         if report.brownout is not None:
             self._brownout.publish(Bool(data=report.brownout))

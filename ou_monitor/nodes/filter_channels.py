@@ -1,8 +1,8 @@
 """
-The signals that `adaptive_filter` takes out of a message and puts back.
+The signals that `adaptive_filter` takes from a message and writes back.
 
-A derivative has the unit of its signal per second, so it does not fit the signal's field:
-it is published in a message of its own type.
+A derivative has another unit than its signal (per second), so it is not written into the field of
+the signal, but published in a message of another type.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Channels:
     # lacks the signals.
     covariance: FieldPath | None = None
     output: str = ''  # Type of the output; empty: the type of the input
-    # Makes the output of a message and filtered values; None: the values replace the signals.
+    # Makes the output from a message and filtered values; None: the values replace the signals.
     make: Callable[[Any, Sequence[float]], Any] | None = None
 
     def take(self, message: Any) -> Sequence[float]:
-        """Return the values in a message; empty if it does not hold them."""
+        """Return the values in a message; empty if it lacks them."""
         if self.covariance is not None and walk(message, self.covariance)[0] == -1.0:
             return ()
         values = [walk(message, path) for path in self.fields]
@@ -61,7 +61,7 @@ _DATA = Channels(('data',), (('data',),))
 _GYRO = Channels(tuple('xyz'), tuple(('angular_velocity', axis) for axis in 'xyz'),
                  ('angular_velocity_covariance',))
 
-# Types that are filtered without naming a field.
+# Types whose signals need not be named.
 CHANNELS: dict[str, Channels] = {
     'std_msgs/msg/Float32': _DATA,
     'std_msgs/msg/Float64': _DATA,
@@ -71,7 +71,7 @@ CHANNELS: dict[str, Channels] = {
 
 
 def channels_of(kind: str, field: str, *, mode: str = 'lowpass') -> Channels:
-    """Return the signals of a type."""
+    """Return the signals of a message type; InputError if `field` is missing or unusable."""
     if field:
         found = _field_channel(kind, field)
     elif kind in CHANNELS:
@@ -80,7 +80,7 @@ def channels_of(kind: str, field: str, *, mode: str = 'lowpass') -> Channels:
         raise InputError(
             f"input.type: cannot filter '{kind}' without input.field (the path of its signal); "
             f'{nearest(kind, CHANNELS)}')
-    # The derivative of a number without a unit is a number, too: the type stays.
+    # A bare number has no unit, so its derivative is published with the same type.
     return found if mode != 'derivative' or found is _DATA else _derivative(kind, found)
 
 
@@ -110,7 +110,7 @@ def _field_channel(kind: str, field: str) -> Channels:
     """Return one field of any installed type, tried on an empty message."""
     message = message_class(kind)()
     steps = value_path(FieldSpec('input', kind, field), definition_of(message_class(kind)))
-    # None: an element that does not exist yet.
+    # None: an array element that an empty message lacks.
     value = walk(message, steps)
     if value is not None and not isinstance(value, float):
         raise InputError(

@@ -1,8 +1,8 @@
 """
 Inputs of a node: find sources on the graph, fetch messages, and give each a time.
 
-The time is the message's own stamp, or else the middleware's source timestamp, which `/clock` maps
-to simulated time under `use_sim_time`.
+The time is the message's own stamp, or else the middleware's source timestamp; under
+`use_sim_time`, `/clock` maps the source timestamp to simulated time.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-# Best effort, because a reliable subscription receives nothing from best-effort publishers; the
-# depth holds 0.2 s at 10 kHz while the estimator fits.
+# Best effort, because a reliable subscription receives nothing from best-effort publishers.  The
+# depth is enough for 0.2 s at 10 kHz, while the estimator is busy with a fit.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
 # Smaller for blocks: 2000 blocks would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Maximum messages and bytes taken at a time: as many as the queue holds; these bytes take about
-# 50 ms and 50 MB of memory to process.
+# Maximum number of messages (the size of the queue) and bytes taken at a time; processing these
+# bytes takes about 50 ms and 50 MB of memory.
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
-# Longest time for which a message may have waited in the middleware's queue of 2000, s.
+# Maximum time for which a message counts as having waited in the middleware's queue, s.
 MOST_WAIT = 60.0
-# Period of reminders, and silence of a publisher before it is reported, s.
+# Period of reminders, and silence of a publisher that is reported, s.
 AGAIN = 60.0
 MUTE = 10.0
 # Sentence for a missing clock in the diagnostics of every node.
@@ -52,7 +52,7 @@ CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Stamper:
-    """Times of messages; `on_jump` is called with the reason when their clock steps."""
+    """Gives messages their times; calls `on_jump` with the reason when their clock jumps."""
 
     def __init__(self, node: MonitorNode, on_jump: Callable[[str], None]) -> None:
         self._node = node
@@ -116,9 +116,10 @@ class Stamper:
 class Arrivals:
     """Messages of one publisher, in order of arrival."""
 
-    column: FieldColumn  # Their content; the send time replaces a missing stamp
-    received: FloatArray  # When the middleware received each, by the wall clock, s; shape (m,)
-    arrived: FloatArray  # The same by the monotonic clock, s; shape (m,)
+    column: FieldColumn  # Their contents; the sending time replaces a missing stamp
+    # When the middleware received each message, by the wall clock, s; shape (m,).
+    received: FloatArray
+    arrived: FloatArray  # The same, by the monotonic clock, s; shape (m,)
 
     def split(self, at: int) -> tuple[Arrivals, Arrivals]:
         """Return the first `at` messages, and the rest."""
@@ -136,12 +137,12 @@ class PolledInput:
         self.topic = node.resolve_topic_name(topic)
         self._input = node.create_polled(
             kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
-        # Messages that cannot be decoded are left out.
+        # Leave out messages that cannot be decoded.
         self._reader = FieldReader(
             spec, definition_of(kind), lambda index, why: None, beside)
         self.publishers = Publishers()
-        # Fetched, not yet read: messages, times of fetching (wall and monotonic clock, s), and
-        # total size, bytes.
+        # Messages fetched but not yet read, the times at which they were fetched (wall and
+        # monotonic clock, s), and their total size, bytes.
         self._fetched: list[tuple[bytes, dict[str, Any]]] = []
         self._when: list[tuple[float, float]] = []
         self._bytes = 0
@@ -176,7 +177,8 @@ class PolledInput:
         sent = np.array([info['source_timestamp'] for info in infos], dtype=np.uint64)
         received = np.array([info['received_timestamp'] for info in infos]) * 1e-9
         received = np.where(received > 0.0, np.minimum(received, wall), wall)
-        # Messages that waited in the middleware arrived earlier (limited: the clock may be set).
+        # Messages have waited in the middleware since their arrival.  The wait is limited, because
+        # the wall clock may be set.
         arrived: FloatArray = np.maximum.accumulate(now - np.clip(
             wall - received, 0.0, MOST_WAIT))
         times: FloatArray = sent.astype(np.float64) * 1e-9
@@ -198,11 +200,11 @@ class PolledInput:
 
 
 def decode(data: bytes, kind: Any, topic: str) -> Any:
-    """Deserialize a message of a class."""
+    """Deserialize a message of a class; InputError if it cannot be read."""
     try:
         return deserialize_message(data, kind)
     except Exception as error:
-        # The middleware has no exception type of its own.
+        # Catch every exception, because the middleware has no exception type of its own.
         raise InputError(f'a message on {topic} cannot be read: {error}') from error
 
 
@@ -247,11 +249,11 @@ class SourceFinder:
         self.sources = {quantity: source for quantity in quantities
                         if (source := find_source(quantity, values)) is not None}
         self.opened: dict[str, Source] = {}
-        # Why a quantity is not used, such as an InputError of `open_source`; '' if it is.
+        # Why each quantity is not used, such as an InputError of `open_source`; '' if it is used.
         self.problems: dict[str, str] = {}
 
     def watch(self, needed: str = '') -> None:
-        """Check the publishers; an InputError in opening the `needed` quantity is raised."""
+        """Check the publishers; raise an InputError if the `needed` quantity cannot be opened."""
         for quantity, source in self.sources.items():
             topic = self._node.resolve_topic_name(source.topic)
             types = types_on(self._node, topic)
@@ -259,7 +261,7 @@ class SourceFinder:
             chosen = source if source.spec is not None else source.choose(types)
             problem = ''
             if opened is not None:
-                # DDS silently drops messages of another type.
+                # DDS drops messages of another type without a report.
                 if types and opened.spec is not None and opened.spec.type not in types:
                     problem = (f"{topic} carries {', '.join(types)}, but msg_config "
                                f"'{opened.config}' expects {opened.spec.type}.")
@@ -301,7 +303,8 @@ class Console:
 
     def waiting(self, topic: str) -> None:
         """Log why no message has arrived on a topic yet."""
-        # Without a publisher: at once, then once a minute; with a silent publisher: after a while.
+        # If there is no publisher, log at once, then once a minute; if there is a silent one, log
+        # after `MUTE`, then once a minute.
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
         if self._node.count_publishers(topic):
             if self._next_report == -math.inf:
@@ -335,7 +338,7 @@ class Console:
 
 
 class PublisherWatch:
-    """Names of the publishers of an input's topic, and counts of their messages, in words."""
+    """Names of the publishers on an input's topic, and notes on their messages."""
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node
@@ -372,7 +375,7 @@ class PublisherWatch:
         return notes
 
     def fields(self) -> dict[str, str]:
-        """Return the same as fields of a status."""
+        """Return publishers and counts as fields of a status."""
         counted = self._publishers
         return {'messages_lost': str(counted.lost),
                 'messages_lost_by': 'sequence numbers' if counted.numbered else 'not known',

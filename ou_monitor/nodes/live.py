@@ -1,9 +1,9 @@
 """
 `ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
 
-The page is read-only.  Limits: HTTP without encryption; on other than loopback addresses, requests
-need the token that the command prints.  Connections beyond `CONNECTIONS` are closed, and so is a
-connection without a complete request after `PATIENCE`.
+The page is read-only.  Limits: HTTP without encryption.  If the address is not a loopback address,
+requests need the token that the command prints.  Connections beyond `CONNECTIONS` are closed, and
+so are connections without a complete request within `PATIENCE`.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _STEP = 0.1
 CONNECTIONS = 64
 # Timeout of a request on an open connection, s.
 PATIENCE = 10.0
-# Maximum header and body of a request, bytes; browsers send about 1000, without a body.
+# Maximum header and body of a request, bytes; browsers send a header of about 1000, and no body.
 _HEADER, _BODY = 16384, 0
-# Maximum digits of a number that is parsed; Python raises an error for a few thousand.
+# Maximum number of digits that are parsed, because Python raises an error for a few thousand.
 _DIGITS = 18
-# Period of a line that keeps an idle connection open, s.
+# Period of the comment lines that keep an idle connection open, s.
 _ALIVE = 5.0
 
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         import tornado.web  # noqa: F401
     except ImportError as error:
         raise InputError(f"live needs tornado: {how_to_install('live')}") from error
-    # Names of nodes with the leading slash that ROS writes.
+    # Node names with a leading slash, as in ROS.
     names = [f"/{name.strip('/')}" for name in (args.estimator, args.filter)]
     return run_ros(NAME, lambda: _serve(args.host, args.port, *names), [])
 
@@ -58,7 +58,7 @@ def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:
     executor = make_executor()
     executor.add_node(node)
 
-    # The server ends with the context.
+    # The thread ends with the context.
     thread = Thread(target=lambda: turn(executor, node))
     thread.start()
     try:
@@ -111,7 +111,7 @@ def make_server(app: Any, patience: float = PATIENCE) -> Any:
             else:
                 super().handle_stream(stream, address)
 
-    # Neither timeout runs while a request is answered, so a stream of rows stays open.
+    # No timeout runs while a request is being answered, so a stream of rows stays open.
     return BoundedServer(app, idle_connection_timeout=patience, body_timeout=patience,
                          max_header_size=_HEADER, max_body_size=_BODY)
 
@@ -135,7 +135,7 @@ def application(node: Any, token: str) -> Any:
                 raise HTTPError(403)
 
         def set_default_headers(self) -> None:
-            """Allow nothing but the page itself."""
+            """Forbid the browser to load anything but the page itself."""
             self.set_header('Content-Security-Policy', policy)
             self.set_header('X-Content-Type-Options', 'nosniff')
             self.set_header('Referrer-Policy', 'no-referrer')
@@ -149,7 +149,7 @@ def application(node: Any, token: str) -> Any:
     class Rows(GuardedHandler):
 
         async def get(self) -> None:
-            """Send rows as they come, after the last one the browser received."""
+            """Send the rows that the browser does not have yet, then new rows as they come."""
             self.set_header('Content-Type', 'text/event-stream')
             # A browser that reconnects sends the number of its last row.
             last = self.request.headers.get('Last-Event-ID', '')
@@ -157,7 +157,7 @@ def application(node: Any, token: str) -> Any:
             sent = int(last) if known else 0
             newest = node.rows(0)
             if newest and sent > newest[-1]['k']:
-                # The number is from another process: start from the beginning.
+                # The browser's number is from an earlier process: start from the beginning.
                 sent = 0
             quiet = 0.0
             try:

@@ -1,8 +1,8 @@
 """
-The node behind the live page: listens to estimator and filter, and keeps the last minute.
+The node of the live page: listens to estimator and filter, and keeps rows of the last minute.
 
 Limits: with five rows per second, the plot of the voltage misses dips between two rows (the flag
-shows them); for the filter's signals, each row has the extremes since the row before.
+shows them).  For the filter's signals, each row has the extremes since the previous row.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from std_msgs.msg import Float64
 PERIOD, KEPT = 0.2, 300
 # Period of checking the graph and the parameters, s.
 _LOOK = 1.0
-# Age above which a state is no longer shown as the present one, s.
+# Age above which a state is no longer shown, s.
 _STALE = 2.0
 # Parameters of the estimator shown on the page.
 _SHOWN = ('brownout.voltage', 'brownout.horizon')
@@ -65,7 +65,7 @@ class LiveNode(Node):
         self.create_timer(_LOOK, self._find_signals)
 
     def rows(self, after: int) -> list[dict[str, Any]]:
-        """Return the rows with larger numbers."""
+        """Return the rows with numbers above `after`."""
         with self._lock:
             return [row for row in self._rows if row['k'] > after]
 
@@ -81,7 +81,7 @@ class LiveNode(Node):
         self._newest[name] = message.data
 
     def _find_signals(self) -> None:
-        """Subscribe to the filter's signals once they exist; request the limit."""
+        """Subscribe to the filter's signals once they exist, and request the estimator's limit."""
         if self._answer is not None and self._answer.done():
             values = self._answer.result().values
             self._limits = {name: value.double_value for name, value in zip(_SHOWN, values)}
@@ -94,7 +94,7 @@ class LiveNode(Node):
             self._listen('raw', source)
 
     def _input(self) -> str:
-        """Return the topic that the filter filters; empty if there is none."""
+        """Return the topic of the filter's input; empty if there is none."""
         space, _, name = self._filter.rpartition('/')
         try:
             topics = self.get_subscriber_names_and_types_by_node(name, space or '/')
@@ -143,7 +143,7 @@ class LiveNode(Node):
 
 
 def known(value: str | float | None) -> float | None:
-    """Return a number as JSON can hold it; None if it is undefined."""
+    """Return a number for JSON; None if it is not a finite number."""
     try:
         number = math.nan if value is None else float(value)
     except ValueError:

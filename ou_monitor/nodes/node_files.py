@@ -2,9 +2,9 @@
 The files of a node: its model, and the latch of the flag, which survives a restart.
 
 A model file is replaced only if it is a regular file and still has the bytes that were read.  The
-latch is a small file with one JSON object: node, level (OK or CRITICAL), reason and time.  A lock
-on its inode shows that the node runs.  An existing latch file is replaced only if it is a regular
-file that names this node.  This module does not import ROS.
+latch is a small file with one JSON object: node, level (OK or CRITICAL), reason and time.  While
+the node runs, it holds a lock on the inode of this file.  An existing latch file is replaced only
+if it is a regular file that names this node.  This module does not import ROS.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-# Timeout of reading or writing a file, s: most take 10 ms, the largest allowed 5 s.
+# Timeout of reading or writing a file, s: most files take 10 ms, the largest allowed take 5 s.
 PATIENCE = 20.0
 # Period of calls that keep the node working while it waits, s.
 PAUSE = 0.02
-# Maximum flights in the history of a model file; maximum size of a model file, bytes.
+# Maximum number of flights in the history of a model file; maximum size of the file, bytes.
 _HISTORY, _LARGEST = 200, 2_000_000
 
 
 class ModelChoice:
-    """Model of the parameter `model_file`; a file is read in a thread when the path changes."""
+    """The model in use, from the parameter `model_file`; a thread reads and writes files."""
 
     def __init__(self) -> None:
         self._used: _Chosen = '', None, b''
@@ -50,7 +50,7 @@ class ModelChoice:
         self._reader = ThreadPoolExecutor(1, 'model_file')
 
     def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
-        """Read the file unless it is in force; `ValueError` says why it cannot be used."""
+        """Read the file unless it is in use; `ValueError` says why it cannot be used."""
         if not path or path == self._used[0]:
             self._checked = self._used if path else ('', None, b'')
             return
@@ -75,7 +75,7 @@ class ModelChoice:
                 meanwhile()
 
     def use(self, path: str) -> SupplyModel | None:
-        """Bring the path checked last into force; return its model."""
+        """Use the file of a path, which must be the one checked last; return its model."""
         if path != self._used[0]:
             if path != self._checked[0]:
                 raise ValueError(f'model_file {path} has not been checked')
@@ -84,13 +84,13 @@ class ModelChoice:
 
     @property
     def terms(self) -> str:
-        """Return the names of the terms in force, separated by commas; empty without a model."""
+        """Return the names of the terms in use, separated by commas; empty without a model."""
         file = self._used[1]
         return '' if file is None else ','.join(term.NAME for term in file.model.terms)
 
     def save(self, load: LoadStart, entry: Mapping[str, object],
              meanwhile: Callable[[], object] = lambda: None) -> str:
-        """Write what a flight has learned, and an entry of the history; return the file's path."""
+        """Write a learned load, and an entry of the history, into the file; return its path."""
         path, file, known = self._used
         if file is None:
             raise InputError('There is no model_file in force.')
@@ -117,7 +117,8 @@ _Chosen = tuple[str, 'ModelFile | None', bytes]
 def _read(path: str) -> tuple[ModelFile, bytes]:
     """Return a parsed model file, and its bytes."""
     try:
-        # Read before the slow import (a second on a busy machine), so that errors come at once.
+        # Read the file before the slow import below (a second on a busy machine), so that errors
+        # are reported at once.
         with open_regular(path) as file:
             known = file.read(_LARGEST)
     except (OSError, ValueError) as error:
@@ -130,7 +131,7 @@ def _read(path: str) -> tuple[ModelFile, bytes]:
 def _save(path: str, file: ModelFile, known: bytes) -> bytes:
     """Replace a model file that still holds `known`; return its new bytes."""
     from ou_monitor.recordings.model_file import as_yaml
-    # Keep comments at the top of the file.
+    # Keep the comments at the top of the file.
     lines = known.decode('utf-8-sig').splitlines(keepends=True)
     head = ''.join(takewhile(lambda line: line.startswith('#'), lines))
     text = (head + as_yaml(file)).encode()
@@ -147,7 +148,7 @@ def _save(path: str, file: ModelFile, known: bytes) -> bytes:
 
 
 def _check_kind(path: str | Path) -> None:
-    """Raise `ValueError` unless it is a regular file: opening a device may have an effect."""
+    """Raise `ValueError` unless it is a regular file, because opening a device has effects."""
     kind = os.lstat(path).st_mode
     if not stat.S_ISREG(kind):
         raise ValueError('it is a symbolic link' if stat.S_ISLNK(kind)
@@ -156,8 +157,8 @@ def _check_kind(path: str | Path) -> None:
 
 @contextmanager
 def _draft(path: Path, text: bytes, mode: int) -> Iterator[tuple[int, str]]:
-    """Give handle and name of a new file beside a path, synced and read back, to be renamed."""
-    # Made by O_CREAT | O_EXCL under a random name, so no other file is opened or removed.
+    """Write a new file in the folder of a path, sync and verify it; yield its handle and name."""
+    # `mkstemp` uses O_CREAT | O_EXCL and a random name, so no other file is opened or removed.
     handle, beside = tempfile.mkstemp(prefix=f'.{path.name}.', dir=path.parent)
     try:
         os.fchmod(handle, mode)
@@ -181,12 +182,12 @@ def _draft(path: Path, text: bytes, mode: int) -> Iterator[tuple[int, str]]:
 # Maximum size of a latch file that is read, bytes; nodes write at most 1000.
 _MOST = 4096
 _KEYS = {'node', 'level', 'reason', 'time'}
-# Time between attempts to write, s.
+# Time between attempts to write the latch file, s.
 RETRY = 1.0
 
 
 class LatchFile:
-    """Keeps the flag of one node in a file, or in a file named after the node in a folder."""
+    """Latch file of a node; if the path is a folder, a file in it that is named after the node."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self.path = Path(path).expanduser()
@@ -194,15 +195,15 @@ class LatchFile:
             self.path /= node.strip('/').replace('/', '_') + '.latch.json'
         # Why the file cannot be used now, one line; empty: the last request is on disk.
         self.problem = ''
-        # Whether the file found at the start must not be changed; its content is unknown.
+        # Whether the file found at the start is unusable, and must not be changed.
         self.refused = False
         self._node = node
-        # Open handle of the file, which holds its lock.
+        # Open handle of the file, which holds the lock.
         self._lock: int | None = None
         self._wanted: dict[str, Any] = self._record(False, '')
         self._written: dict[str, Any] | None = None
         self._last_try = 0.0
-        # A disk may take a second for an fsync: not in a callback.
+        # A thread writes, because an fsync may take a second, too long for a callback.
         self._writer = ThreadPoolExecutor(1, 'latch_file')
         self._job: Future[None] | None = None
 
@@ -211,7 +212,7 @@ class LatchFile:
                 'reason': reason[:300], 'time': time.time()}
 
     def read(self) -> str:
-        """Claim or create the file; return why and when the flag was latched, if it was."""
+        """Claim or create the file; return why and when the flag was latched, or ''."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             found = self._claim()
@@ -231,7 +232,7 @@ class LatchFile:
         return f'latched before a restart of the node, at {when}: {reason}'
 
     def keep(self, latched: bool, reason: str) -> None:
-        """Write whether the flag is latched; called often, it retries a write."""
+        """Write whether the flag is latched; call it often, because it also retries writes."""
         if self.refused:
             return
         changed = latched != (self._wanted['level'] == 'CRITICAL')
@@ -250,7 +251,7 @@ class LatchFile:
         self._keep_lock(None)
 
     def _write(self, record: dict[str, Any]) -> None:
-        """Replace the file, unless the job before has written the same."""
+        """Replace the file, unless an earlier job has written the same record."""
         if self._written is record:
             return
         try:
@@ -262,13 +263,13 @@ class LatchFile:
         self._written, self.problem = record, ''
 
     def _claim(self) -> dict[str, Any] | None:
-        """Return the content of the file, locked from here on; None: no file."""
+        """Lock the file and return its content; None if there is no file."""
         try:
-            # Opening a FIFO would give it a reader.
+            # Check before opening, because opening a FIFO would give it a reader.
             _check_kind(self.path)
         except FileNotFoundError:
             return None
-        # A link or other file in its place is not followed, waited for or locked.
+        # If a link or another file has taken its place since, do not follow, wait for, or lock it.
         handle = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             found = self._parse(handle)
@@ -278,7 +279,7 @@ class LatchFile:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     raise ValueError('another node of this name is using it') from None
-                # Its owner replaces the file before releasing the lock.
+                # The lock may be of a file that its owner has just replaced.
                 if not os.path.samestat(os.lstat(self.path), mine):
                     raise ValueError('another node of this name is using it')
                 self._keep_lock(handle)
@@ -310,11 +311,12 @@ class LatchFile:
     def _replace(self, text: bytes) -> None:
         """Write a new file, sync, read back and lock it, and rename it over the old one."""
         exists = self._claim() is not None
-        # Readable by all, like an ordinary file.
+        # Readable by everyone, like an ordinary file.
         with _draft(self.path, text, 0o644) as (handle, beside):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not exists:
-                # Fails if a file has appeared meanwhile (so would a link, which FAT lacks).
+                # Fails if a file has appeared meanwhile.  (`os.link` would fail too, but FAT has
+                # no links.)
                 os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
             os.rename(beside, self.path)
             self._keep_lock(handle)
@@ -322,7 +324,7 @@ class LatchFile:
             raise ValueError('another file has taken its place')
 
     def _keep_lock(self, handle: int | None) -> None:
-        """Keep the handle that has the lock; close the one before."""
+        """Keep the handle that has the lock; close the previous one."""
         old, self._lock = self._lock, handle
         if old is not None:
             os.close(old)

@@ -1,9 +1,9 @@
 """
 The node of `replay`: publish the messages of a bag as recorded, and /clock.
 
-The schedule is absolute, so a late message does not delay the next ones.  Unpacking a chunk of a
-bag takes longer than the spacing of its messages, so a separate thread reads a bounded number of
-messages ahead.
+The schedule is absolute, so a late message does not delay later ones.  Unpacking a chunk of a bag
+takes longer than the spacing of its messages, so a thread reads a limited number of messages
+ahead.
 """
 
 from __future__ import annotations
@@ -36,40 +36,40 @@ from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-# Queue depth: the middleware must send a burst before it is overwritten.
+# Depth of the publishers' queues, which must hold a burst until the middleware has sent it.
 DEPTH = 1000
-# Timeout for reliable subscribers at the end.
+# Maximum wait at the end until reliable subscribers have received all messages.
 FLUSH = Duration(seconds=1)
 
 RCLError = rclpy_implementation.RCLError
 
 Message = tuple[str, str, int, bytes]
-# Messages that the thread hands over at a time, and maximum number of batches held: about 20 s at
-# 10 kHz, some 50 MB.
+# Number of messages in a batch of the thread, and maximum number of batches read ahead: about 20 s
+# at 10 kHz, and 50 MB.
 BATCH, AHEAD = 1000, 200
 
 
 class SpacingError:
-    """Deviations of the spacing of events from the intended one, in whole microseconds."""
+    """Deviations of the spacing of events from the intended spacing, in whole microseconds."""
 
     def __init__(self) -> None:
-        # A histogram, so that days of replay take no more memory than minutes.
+        # A histogram takes no more memory for days of replay than for minutes.
         self._counts: Counter[int] = Counter()
         self._last: tuple[float, float] | None = None
 
     def restart(self) -> None:
-        """Begin a new pass: the gap before it is not counted."""
+        """Begin a new pass, without counting the gap before it."""
         self._last = None
 
     def add(self, due: float, done: float) -> None:
-        """Take one event: its due time and its actual time, s."""
+        """Take the due time and the actual time of an event, s."""
         if self._last is not None:
             error = (done - self._last[1]) - (due - self._last[0])
             self._counts[round(abs(error) * 1e6)] += 1
         self._last = (due, done)
 
     def summary(self) -> dict[str, float]:
-        """Return p50, p99 and max, s; empty when there was no spacing."""
+        """Return the errors p50, p99 and max, s; empty with fewer than two events."""
         if not self._counts:
             return {}
         errors = np.array(sorted(self._counts.items())).T
@@ -79,7 +79,7 @@ class SpacingError:
 
 
 class Prefetch:
-    """Iterate over a source that a thread reads ahead, up to `ahead` batches; raise its errors."""
+    """Iterates over a source; a thread reads up to `ahead` batches ahead, and passes on errors."""
 
     def __init__(self, source: Iterable[Message], ahead: int = AHEAD, batch: int = BATCH) -> None:
         self._batches: Queue[list[Message] | None] = Queue(ahead)
@@ -108,7 +108,7 @@ class Prefetch:
         try:
             while not self._closed.is_set():
                 batch = []
-                # Messages before an error are kept.
+                # `extend` keeps the messages before an error.
                 batch.extend(itertools.islice(source, size))
                 if self._batches.full() or not batch:
                     self._full.set()
@@ -130,7 +130,7 @@ class Prefetch:
 
 
 class Player(Node):
-    """Publishes one bag, by the checked options of `replay`."""
+    """Publishes one bag with the checked options of `replay`."""
 
     def __init__(self, name: str, bag: BagReader, options: argparse.Namespace) -> None:
         super().__init__(name, start_parameter_services=False)
@@ -175,7 +175,7 @@ class Player(Node):
     def play(self) -> dict[str, Any]:
         """Play until the end, or a signal; return what was done."""
         self._wait_for_subscriber()
-        # The garbage collector's pauses would show in the spacing.
+        # Avoid pauses by the garbage collector, which would disturb the spacing.
         gc.collect()
         gc.freeze()
         began = time.monotonic()
@@ -223,7 +223,7 @@ class Player(Node):
                              + ', '.join(self._outputs))
         origin, rate = first[2], self._options.rate
         start, frequency = time.monotonic(), self._options.clock
-        # Times of /clock; missed ones are skipped, so that late ticks do not pile up.
+        # Number and time of the next /clock; missed ones are skipped, so that they do not pile up.
         ticks, tick = 0, start if frequency > 0.0 else math.inf
         for topic, _, log_time, data in itertools.chain((first,), messages):
             due = start + (log_time - origin) * 1e-9 / rate
@@ -244,11 +244,11 @@ class Player(Node):
         self._passes += 1
 
     def _tick(self, origin: int, start: float) -> None:
-        """Publish the schedule's clock as it is now."""
+        """Publish the present time of the schedule on /clock."""
         if self._clock_output is None:
             return
         now = origin + round((time.monotonic() - start) * self._options.rate * 1e9)
-        # At a high rate the last tick would exceed the range of a stamp.
+        # At a high rate, the last tick might exceed the range of a stamp.
         now = min(max(now, 0), LAST_HEADER_NS)
         self._send(self._clock_output, ClockMessage(clock=Time(nanoseconds=now).to_msg()))
 
@@ -256,7 +256,7 @@ class Player(Node):
         try:
             output.publish(message)
         except RCLError:
-            # A signal has just ended the context; the loop will notice.
+            # If a signal has just ended the context, the caller's loop ends too.
             if self.going():
                 raise
 

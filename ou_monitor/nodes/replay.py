@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def options(arguments: list[str]) -> argparse.Namespace:
-    """Return the checked options."""
+    """Return the checked options; InputError if one is bad."""
     found = parser().parse_args(arguments)
     if not (math.isfinite(found.rate) and found.rate > 0.0):
         raise InputError(f'--rate must be a positive number, got {found.rate}')

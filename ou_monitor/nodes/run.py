@@ -2,9 +2,9 @@
 Start, spin and end a node: the same for every executable.
 
 Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 for unusable user input, with one
-FATAL line that says what is wrong and what to do; SIGALRM if the middleware hangs (`END`);
-anything else is a bug and shows its traceback.  This module can be imported where ROS 2 is not
-installed, so that the executables can report that.
+FATAL line that says what is wrong and what to do; SIGALRM if the middleware hangs (`END`).
+Anything else is a bug and shows its traceback.  This module can be imported without ROS 2, so that
+the executables can report that ROS 2 is not installed.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from typing import Any, NoReturn
 
 from ou_monitor.errors import InputError, refusal
 
-# Set before NumPy is loaded.  Matrices here are small, and BLAS threads that share a core wait for
-# one another: 0.1 s each time in a node with real-time priority beside another task.
+# Set before NumPy is loaded.  Matrices are small here, and BLAS threads that share a core wait for
+# one another: for 0.1 s each time, in a node with real-time priority beside another task.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 BAD_INPUT = 2
-# Maximum wait inside the executor, s; a signal wakes it anyway.
+# Maximum wait inside the executor, s; a signal ends the wait.
 NAP = 1.0
 # Timeout of ending a node, s.  Ending takes 0.02 s of CPU, and took at most 0.5 s with 12 tasks on
 # two cores.  But if another process was stopped while it held a lock in shared memory, Fast DDS
-# waits 10 s for the lock and then aborts, and Python does not run while it waits.
+# waits 10 s for the lock, during which Python does not run, and then aborts.
 END = 1.0
 # Variables that give Fast DDS its profiles (the older name first), or its transports.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
-# Set while a signal may end the process at once, and while it may interrupt making a node.
+# Set while a signal may end the process at once, and while a signal may interrupt the creation of
+# a node.
 _loading, _making = threading.Event(), threading.Event()
 
 
@@ -47,11 +48,11 @@ def one_line(text: object) -> str:
 
 def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> int:
     """Initialise ROS 2, do the work, shut down; return the exit status."""
-    # rclpy ends the context on SIGINT and SIGTERM and then calls the previous handler.  Python's
-    # own would raise KeyboardInterrupt inside a callback, which the EventsExecutor turns into
-    # SystemError: so `note` only records the signal.  While modules are still being loaded nothing
-    # needs an orderly end: the process ends at once. While a node is being made no callback runs,
-    # and the signal raises like any error.
+    # rclpy ends the context on SIGINT and SIGTERM, and then calls the previous handler.  Python's
+    # own handler would raise KeyboardInterrupt inside a callback, which the EventsExecutor turns
+    # into SystemError; so `note` only records the signal.  While modules are still being loaded,
+    # there is nothing to clean up, so the process ends at once.  While a node is being created, no
+    # callback runs, so `note` raises an exception.
     stopped: list[int] = []
     _loading.set()
 
@@ -59,13 +60,14 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
         if _loading.is_set():
             os._exit(0)
         stopped.append(number)
-        # Only the first signal: a second would interrupt the cleanup.
+        # Only for the first signal, because a second one would interrupt the cleanup.
         if _making.is_set() and len(stopped) == 1:
             from rclpy.executors import ExternalShutdownException
             raise ExternalShutdownException
 
-    # The handlers stay until the process ends.  With Ctrl-C both the terminal and ros2 launch send
-    # SIGINT, and Python's handler would raise in a destructor of the middleware, which aborts.
+    # The handlers stay until the process ends.  After Ctrl-C, both the terminal and ros2 launch
+    # send SIGINT; Python's handler would raise an exception in a destructor of the middleware,
+    # which then aborts.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, note)
     try:
@@ -75,7 +77,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
 
 
 def loaded() -> None:
-    """No longer let a signal end the process at once: now there is something to clean up."""
+    """From now on, do not end the process at once on a signal, because it has to clean up."""
     _loading.clear()
 
 
@@ -89,7 +91,7 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
         from rclpy.utilities import remove_ros_args
         left = remove_ros_args(sys.argv)[1:]
         if left:
-            # rclpy would start without it, for example with another fmin than requested.
+            # rclpy would ignore it, and run, for example, with another fmin than requested.
             raise InputError(f"'{left[0]}' is not an option: parameters and remappings go after "
                              '--ros-args, as in --ros-args -p NAME:=VALUE -r FROM:=TO')
         return work()
@@ -98,7 +100,7 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
 
 
 def end(status: int) -> NoReturn:
-    """Close what needs closing, DDS included, and exit without unloading the interpreter."""
+    """Run the exit handlers, close DDS, and exit without unloading the interpreter."""
     # Unloading takes 0.1 to 0.3 s, and waits for the threads that tabulate the risk.
     gc.collect()
     atexit._run_exitfuncs()
@@ -136,23 +138,23 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
     except ExternalShutdownException:
         return 0
     except (binding.RCLError, InvalidHandle, NotInitializedException):
-        # A signal has ended the context while a node was being built: not a failure.
+        # Ignore the error if a signal has ended the context while a node was being created.
         if stopped and not rclpy.ok():
             return 0
         raise
     finally:
         rclpy.try_shutdown()
         if stopped:
-            # The signal has ended the context, but its last log lines are not written yet.
+            # After a signal, write the last log lines of the context, which are still buffered.
             binding.rclpy_logging_fini()
 
 
 def _choose_queues() -> None:
     """Make Fast DDS keep messages while the process has no CPU, unless the user configured it."""
-    # By default a queue holds 512 messages of all topics together, and is given up with its
-    # content if the process does not read for 1 s. Other middlewares ignore these variables. If
-    # discovery is limited to this machine, the configuration is not changed: rmw_fastrtps would
-    # add transports of its own, and a message might arrive through either.
+    # By default, a queue holds 512 messages of all topics together, and is discarded with its
+    # contents if the process does not read for 1 s.  Other middlewares ignore these variables.  If
+    # discovery is limited to this machine, do not change the configuration, because rmw_fastrtps
+    # adds its own transports then, and messages might use either set of transports.
     beside = (Path('DEFAULT_FASTRTPS_PROFILES.xml'), Path('DEFAULT_FASTDDS_PROFILES.xml'))
     local = (os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')
              or os.environ.get('ROS_LOCALHOST_ONLY') == '1')
@@ -166,9 +168,9 @@ def _choose_queues() -> None:
 
 
 def spin(make: Callable[[], Any]) -> int:
-    """Make one node and spin it until its context ends, then destroy it."""
-    # The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor loses most of
-    # them; it is used if this rclpy has it.
+    """Create a node, spin it until its context ends, then destroy it."""
+    # The EventsExecutor, which this rclpy may lack, handles 10 000 messages/s, of which the
+    # SingleThreadedExecutor loses most.
     executor = make_executor()
     loaded()
     _making.set()
@@ -179,10 +181,10 @@ def spin(make: Callable[[], Any]) -> int:
     executor.add_node(node)
     manager = ServiceManager()
     if manager.interval:
-        # By a timer of the node, so that it stops when the executor serves no more timers.
+        # Use a timer of the node, so that the signal stops if the executor no longer runs timers.
         node.every(manager.interval, lambda: manager.tell('WATCHDOG=1'))
-    # Freeze loaded objects: a garbage collection over them blocks for 40 ms, and delays the end of
-    # the process by 0.2 s.
+    # Freeze the loaded objects, because a garbage collection over them blocks for 40 ms, and would
+    # delay the end of the process by 0.2 s.
     gc.freeze()
     manager.tell('READY=1')
     try:
@@ -190,7 +192,7 @@ def spin(make: Callable[[], Any]) -> int:
             node.context.try_shutdown()
     finally:
         manager.tell('STOPPING=1')
-        # If ending hangs, this signal ends the process; a latch is already on disk.
+        # If ending hangs, SIGALRM ends the process; a latch is already on disk by then.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, END)
         executor.remove_node(node)
@@ -199,10 +201,10 @@ def spin(make: Callable[[], Any]) -> int:
 
 
 def turn(executor: Any, node: Any) -> bool:
-    """Serve a node until its context ends; return whether a signal has ended it."""
+    """Run a node's callbacks until its context ends; return whether a signal has ended it."""
     from rclpy.executors import ExternalShutdownException
     try:
-        # Not executor.spin(), which in rclpy 7.1.6 goes on for ever after a signal.
+        # Do not use executor.spin(), which in rclpy 7.1.6 never returns after a signal.
         while node.context.ok():
             executor.spin_once(timeout_sec=NAP)
     except ExternalShutdownException:
@@ -221,18 +223,18 @@ def make_executor() -> Any:
 
 
 class ServiceManager:
-    """The service manager that has started this process, if any."""
+    """The service manager (systemd) that has started this process, if any."""
 
     def __init__(self) -> None:
         self._address = os.environ.get('NOTIFY_SOCKET', '')
-        # A watchdog set for another process is ignored.
+        # Ignore a watchdog that is set for another process.
         ours = os.environ.get('WATCHDOG_PID', str(os.getpid())) == str(os.getpid())
         span = os.environ.get('WATCHDOG_USEC', '') if self._address and ours else ''
         # Period of the watchdog message, half of the manager's timeout, s; 0: none.
         self.interval = 0.5e-6 * int(span) if span.isdigit() else 0.0
 
     def tell(self, state: str) -> None:
-        """Send one state, 'READY=1'; a failure to send is ignored."""
+        """Send a state, such as 'READY=1'; ignore failures."""
         if not self._address:
             return
         # An abstract name begins with a zero byte, which the variable writes as @.

@@ -1,8 +1,8 @@
 """
 Topics, types and fields of voltage, throttle and motor speeds.
 
-They come from a msg_config; with `auto`, the type that a publisher offers on the topic selects a
-generic msg_config.  Parameters override single entries.
+A msg_config gives them; with `auto`, the message type of the topic's publisher selects a generic
+msg_config.  Parameters override single entries.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
 MOTOR_PARAMETERS: tuple[Parameter, ...] = (
     _CONFIG, *_where('throttle', 'throttle'), *_where('rpm', 'motor speeds'))
 
-# In auto mode a bare scalar serves as throttle without its own msg_config.
+# In auto mode, throttle may be a bare scalar, which needs no msg_config.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 _ARRAYS = ('std_msgs/msg/Float32MultiArray', 'std_msgs/msg/Float64MultiArray')
 
 
 @dataclass(frozen=True)
 class Source:
-    """One quantity: specified, or to be determined from its publisher."""
+    """Where one quantity comes from: specified, or to be determined from its publisher."""
 
     quantity: str  # 'voltage', 'throttle' or 'rpm'
     topic: str  # Topic, relative or absolute
-    spec: FieldSpec | None  # Where the quantity is; None until the publisher's type is known
-    config: str  # Its msg_config
+    spec: FieldSpec | None  # Field of the quantity; None until the publisher's type is known
+    config: str  # Name of its msg_config
     install: str = ''  # What to install when the package of the type is missing
     candidates: tuple[Source, ...] = ()  # Choices in auto mode
     current: FieldSpec | None = None  # For a voltage: the field of the current
@@ -73,18 +73,18 @@ class Source:
 
     @property
     def known_types(self) -> list[str]:
-        """Return the types that can be chosen from."""
+        """Return the message types of the candidates."""
         return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
 
     def open_many(self) -> tuple[Any, ManyExtractor]:
-        """Return the message class and a function that reads several of its numbers."""
+        """Return the message class and an extractor that reads several numbers of a message."""
         message, spec = self._open()
         extractor = ManyExtractor(spec)
         extractor.extract(message())
         return message, extractor
 
     def open(self) -> tuple[Any, FieldSpec]:  # noqa: A003
-        """Return the message class and where the quantity is in its messages."""
+        """Return the message class and the field of the quantity; InputError if unusable."""
         message, spec = self._open()
         definitions = definition_of(message)
         value_path(spec, definitions)
@@ -98,7 +98,7 @@ class Source:
 
 
 def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
-    """Return the source of a quantity according to the parameters."""
+    """Return the source of a quantity by the parameters; None if the msg_config lacks it."""
     topic, kind, field = (str(values[f'{quantity}.{key}']) for key in ('topic', 'type', 'field'))
     rate = float(values['adc.sample_rate']) if quantity == 'voltage' else 0.0
     if values['msg_config'] == AUTO:
@@ -123,7 +123,7 @@ def _generic(quantity: str) -> list[Source]:
     """Return the generic msg_configs' entries for a quantity, one per type."""
     found: dict[str, Source] = {}
     if quantity != 'voltage':
-        # Bare numbers are the same in all msg_configs, so none is named.
+        # Bare numbers are the same in all msg_configs, so no msg_config is named.
         for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
@@ -134,7 +134,7 @@ def _generic(quantity: str) -> list[Source]:
 
 
 def _config_source(config: MsgConfig, quantity: str) -> list[Source]:
-    """Return the source that a msg_config describes; empty if it does not have the quantity."""
+    """Return the source that a msg_config describes; empty if it lacks the quantity."""
     spec: FieldSpec | None = getattr(config, quantity)
     if spec is None:
         return []
@@ -144,7 +144,7 @@ def _config_source(config: MsgConfig, quantity: str) -> list[Source]:
 
 
 def _user_source(quantity: str, topic: str, kind: str, field: str) -> Source:
-    """Return a source of any installed type; a header's stamp is used if it has one."""
+    """Return a source of any installed type; if the type has a header, its stamp is used."""
     if not field:
         raise InputError(
             f"{quantity}.type is '{kind}', which no generic msg_config describes: give "
@@ -167,31 +167,32 @@ def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
     return replace(source, topic=spec.topic, spec=spec)
 
 
-# Where the ament index of a prefix lists its packages, a file each.
+# Folder of the ament index below a prefix, with a file for each package.
 _INDEX = 'share/ament_index/resource_index/packages'
 
-# rosidl's names of the primitives in Python, and in a definition.
+# Names of primitive types: in rosidl's Python, and in a definition.
 _WORDS = {'float': 'float32', 'double': 'float64', 'boolean': 'bool', 'octet': 'byte'}
 _SEQUENCE = re.compile(r'sequence<(.*?)(?:, \d+)?>')
 _ARRAY = re.compile(r'(.*)\[(\d+)\]')
 
 
 def _is_indexed(package: str) -> bool:
-    """Whether an ament index lists a package, in a sourced prefix or this environment."""
+    """Whether the ament index of a sourced prefix or of this environment lists a package."""
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     return any(prefix and (Path(prefix) / _INDEX / package).is_file()
                for prefix in (*prefixes, sys.prefix))
 
 
 def message_class(name: str, install: str = '') -> Any:
-    """Return the class of a message type."""
+    """Return the class of a message type; InputError if it is not installed."""
     parts = name.split('/')
     if len(parts) != 3 or parts[1] != 'msg' or not all(part.isidentifier() for part in parts):
         raise InputError(f"'{name}' is not a message type: write 'package/msg/Type'")
     package, _, kind = parts
     try:
         if not _is_indexed(package):
-            # A bag must not choose which Python modules are loaded.
+            # Load only packages of the index, because a bag must not choose which Python modules
+            # are loaded.
             raise ModuleNotFoundError(package)
         module = importlib.import_module(package + '.msg')
     except ModuleNotFoundError as error:
@@ -206,7 +207,7 @@ def message_class(name: str, install: str = '') -> Any:
 
 
 def definition_of(kind: Any) -> Definitions:
-    """Return the fields of a message class, nested ones included."""
+    """Return the fields of a message class and of its nested messages."""
     found: Definitions = {}
 
     def add(name: str, message: Any) -> None:

@@ -1,11 +1,11 @@
 """
 The node `supply_simulator`: publish the voltage of a saved model under throttle.
 
-A thread simulates samples under the newest throttle and publishes each when the node's clock
+A thread simulates samples under the newest throttle, and publishes each when the node's clock
 reaches its time.  doc/simulation.md describes topics, parameters and `~/reset`.
 
-Limits: one voltage, no current.  Above 200 Hz samples are drawn in pieces of 20 ms, so throttle
-acts up to 20 ms later, and the stamped messages of a piece are sent together.
+Limits: one voltage, no current.  Above 200 Hz, samples are drawn in pieces of 20 ms, so throttle
+acts up to 20 ms late, and messages with a stamp are sent together at the end of a piece.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ou_monitor.simulation import (
     is_recording, lacks, Profile, read_profile, read_throttle, RunningSupply, STICK_RATE)
 from ou_monitor.stream.config import parse_field_path, put, walk
 
-# Read again at each reset; scale_resistance also takes effect at once.
+# These are read again at each reset; scale_resistance also takes effect at once.
 LIVE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('seed', 0, 'Seed of the random numbers, from the next ~/reset on.', 0, 2**31 - 1),
     Parameter('capacity_left', -1.0,
@@ -49,22 +49,23 @@ FIXED_PARAMETERS: tuple[Parameter, ...] = (
 _SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name != 'adc.sample_rate')
 # Types if the parameters do not specify them.
 _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
-# Up to this rate, Hz, samples are drawn one by one; above it, in pieces of this length, s: a call
-# of the model takes 0.2 ms of CPU, and waking the thread costs as much as a message.
+# Up to this rate, Hz, samples are drawn one by one; above it, in pieces of this length, s, because
+# a call of the model takes 0.2 ms of CPU, and waking the thread costs as much as a message.
 _EACH, _AHEAD = 200.0, 0.02
-# Time for which the last throttle is held, s; then the craft idles.
+# Time for which the last throttle is held, s; after it, throttle is 0.
 _HOLD = 1.0
-# Throttle beyond this is invalid (as in the estimator); below, it is clipped to 0..1.
+# Throttle beyond this value is ignored (as in the estimator); otherwise, it is clipped to 0..1.
 _MOST_THROTTLE = 2.0
 # If the clock and the next sample differ by more than this, s, the clock was set, and samples
-# continue from its time.  A machine under load pauses for up to a second.
+# continue from the clock's time.  The limit is larger than pauses under load, which last up to a
+# second.
 _JUMP = 5.0
 # Period of checking simulated time, s.
 _LOOK = 0.002
 
 
 class Sender:
-    """Publishes a number and its stamp as a msg_config says."""
+    """Publishes a number and its stamp in the message that a msg_config describes."""
 
     def __init__(self, node: MonitorNode, source: Source) -> None:
         if source.spec is None:
@@ -85,7 +86,7 @@ class Sender:
         self._output = node.create_publisher(kind, source.topic, 100)
 
     def send(self, stamp: float, value: float) -> None:
-        """Publish (stamp in s)."""
+        """Publish a value (stamp in s)."""
         self._set((value - self._offset) / self._scale)
         if self.stamp is not None:
             self.stamp(stamp)
@@ -112,7 +113,7 @@ def _setter(message: Any, path: str, kind: str, stamp_factor: float = math.nan,
 
 
 class SupplySimulatorNode(MonitorNode):
-    """The voltage of a model, as a node."""
+    """Simulates the voltage of a saved model, as a node."""
 
     RUN_TIME = LIVE_PARAMETERS
     FIXED = (*_SOURCES, *FIXED_PARAMETERS)
@@ -153,7 +154,7 @@ class SupplySimulatorNode(MonitorNode):
         self.run_beside(self._run)
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Bring the resistance into force."""
+        """Apply the resistance."""
         self._run_now.simulation.resistance = values['scale_resistance']
 
     def check(self, values: Mapping[str, Any]) -> None:
@@ -180,7 +181,7 @@ class SupplySimulatorNode(MonitorNode):
         return f"Restarted with seed {values['seed']}."
 
     def _play(self, text: str) -> tuple[Profile, float, Sender] | None:
-        """Return the throttle that is played, its length, s, and its publisher."""
+        """Return the throttle to play, its length, s, and its publisher; None: nothing to play."""
         if not text:
             return None
         if self._throttle_source is None:
@@ -204,7 +205,7 @@ class SupplySimulatorNode(MonitorNode):
         self._input = PolledInput(self, kind, source.topic, spec)
 
     def _newest_throttle(self) -> float:
-        """Return the throttle now: the newest, held for a second; then 0."""
+        """Return the newest throttle, which is held for `_HOLD`; after that, 0."""
         found = None if self._input is None else self._input.take()
         if found is not None:
             good = np.flatnonzero(np.abs(found.column.values) <= _MOST_THROTTLE)
