@@ -1,7 +1,7 @@
 """
 Everything that the node computes, without ROS: estimate, risk, and the health of the input.
 
-The node pushes samples and asks for a report.  The offline tools do the same with a recording, so
+The node pushes samples and requests reports.  The offline tools do the same with a recording, so
 both give the same results for the same data.
 """
 
@@ -33,13 +33,13 @@ from ou_monitor.timeline import (
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
 
-# Cautions that make the numbers doubtful; the others only inform.
+# Cautions that make the numbers doubtful; the other cautions are only information.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
                        Flag.TREND, Flag.IRREGULAR})
-# Minimum voltage of a supply that is on, V: one cell has at least 2.5 V, noise without a supply
+# Minimum voltage of a supply that is on, V: a cell has at least 2.5 V; without a supply, noise is
 # at most 0.5 V.
 _POWERED = 2.0
-# Time after which a much lower or higher voltage counts as another supply, s.
+# Time after which a much lower or much higher voltage counts as another supply, s.
 _ANOTHER = 60.0
 
 
@@ -50,14 +50,14 @@ class SupplyMonitor:
     Parameters
     ----------
     settings : MonitorSettings, optional
-        Settings; the defaults when left out.
+        Settings; by default, the default parameters.
     model : SupplyModel, optional
-        Terms of the supply, as `discover` found them; none when left out.
+        Terms of the supply, as `discover` found them; by default, none.
     background : bool
-        Whether with window ``auto`` the fits of alpha, sigma and Var_inf are made in a thread,
-        so that reports never wait.
+        Whether, with window ``auto``, the fits of alpha, sigma and Var_inf run in a thread, so
+        that reports never wait.
     look : float
-        Interval at which the risk compares its forecasts with the outcomes, s.
+        Interval at which forecasts of the risk are compared with their outcomes, s.
     replay : bool
         Whether only risks within the horizon of the settings are needed, and no flag.
 
@@ -79,12 +79,12 @@ class SupplyMonitor:
         self._settings = settings or MonitorSettings()
         self._background, self._look, self._replay = background, look, replay
         if model is not None and not hasattr(model, 'load'):
-            raise TypeError(f'model: a SupplyModel is needed, got a {type(model).__name__}; that '
-                            'of a file is read_model(path).model')
+            raise TypeError(f'model: a SupplyModel is needed, got a {type(model).__name__}; for a '
+                            'model file, pass read_model(path).model')
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()
-        # Quality of the stamps, and doubt of the input, in the last report.
+        # Quality of the stamps, and doubt about the input, in the last report.
         self._stamps, self._doubt = StampOrder.GOOD, Doubt.NONE
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
@@ -97,7 +97,7 @@ class SupplyMonitor:
         self._begin()
 
     def _begin(self, line: TimeLine | None = None) -> None:
-        # Voltage of the supply, V, slowly decaying while off, and stamp when it was last on, s.
+        # Voltage of the supply, V (decays slowly while off); stamp at which it was last on, s.
         self._level, self._on_at = NAN, NAN
         self._line = line or TimeLine()
         self._estimator = SlidingEstimator(self._sliding, line=self._line)
@@ -131,7 +131,7 @@ class SupplyMonitor:
 
     @property
     def load_filter(self) -> LoadFilter:
-        """Return the load filter; parameters never reset it, errors of the estimator do."""
+        """Return the load filter; errors of the estimator reset it, parameters never do."""
         return self._load_filter
 
     @property
@@ -157,12 +157,12 @@ class SupplyMonitor:
         t, voltage, throttle : array_like, shape (n,), or float
             Stamps, s; voltage, V; throttle, 0..1 (one number for all samples; None: unknown).
         arrival : array_like, shape (n,), optional
-            Arrival of each sample, s, on the clock of `now` of `report`.  The check against the
-            voltage floor uses it for samples whose stamps are late.
+            Arrival of each sample, s, by the clock of `report`'s argument `now`.  The check
+            against the voltage floor uses it for samples whose stamps are late.
         current : array_like, shape (n,), or float, optional
             Current drawn from the supply, A, positive; NaN where unknown.
         thin : int
-            Only every `thin`-th sample goes to the estimator; the floor checks all of them.
+            Only every `thin`-th sample goes to the estimator; all are checked against the floor.
 
         Raises
         ------
@@ -189,14 +189,14 @@ class SupplyMonitor:
             for batch in self._line.take(columns, self._sliding):
                 self._take(batch, came)
         except Exception as error:
-            # Catch every error, because a monitor that stops here would report nothing.
+            # Catch every error, because after an exception here nothing would be reported.
             self.restart(error)
 
     def _take(self, batch: Batch, came: float) -> None:
-        """Pass on readings while the supply is on; begin anew when it is switched on."""
+        """Pass on readings while the supply is on; start again when it is switched on."""
         t, level = float(batch.t[-1]), self._level
         if math.isnan(level) and batch.t.size > 3 and not batch.again:
-            # The first readings decide whether it is on.
+            # The first readings show whether the supply is on.
             self._take(Batch.of(batch.columns[:, :3], batch.restart), came)
             self._take(Batch.of(batch.columns[:, 3:], False, before=float(batch.t[2])), came)
             return
@@ -227,9 +227,9 @@ class SupplyMonitor:
 
     def watch(self, voltage: npt.ArrayLike, arrival: npt.ArrayLike) -> None:
         """
-        Check samples without a time stamp against the voltage floor only.
+        Check samples without a stamp against the voltage floor only.
 
-        Voltage in V and arrival in s, shape (n,), as for `push`.
+        Voltage in V and arrival in s, shape (n,), as in `push`.
         """
         volts = plausible(np.atleast_1d(np.asarray(voltage, dtype=np.float64)), MOST_VOLTAGE)
         times = np.atleast_1d(np.asarray(arrival, dtype=np.float64))
@@ -237,7 +237,7 @@ class SupplyMonitor:
         self._flag.push(np.full_like(volts, NAN), volts, times, self._trust.interval)
 
     def restart(self, error: BaseException) -> None:
-        """Restart after an error, which the next reports name; the flag keeps its state."""
+        """Restart after an error, which the next reports state; the flag keeps its state."""
         words = ' '.join(str(error).split())[:200]
         self._fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
         self._faulty = True
@@ -252,7 +252,7 @@ class SupplyMonitor:
 
     def distrust(self, reason: str) -> None:
         """
-        Do not trust the input, for this reason, until called with an empty reason.
+        Distrust the input for this reason, until called with an empty reason.
 
         The check against the voltage floor continues.
         """
@@ -260,7 +260,7 @@ class SupplyMonitor:
 
     def clear_brownout(self) -> str:
         """
-        Clear a CRITICAL that is latched or held; the next report decides again.
+        Clear a CRITICAL flag that is latched or held; the next report judges again.
 
         Returns
         -------
@@ -273,7 +273,7 @@ class SupplyMonitor:
                 if self._flag.clear() else '')
 
     def set_brownout(self, reason: str) -> None:
-        """Restore a CRITICAL flag after a restart; latch, hold and clearing work as usual."""
+        """Restore a CRITICAL flag after a restart; latch, hold and clearing apply as usual."""
         self._flag.set_critical(reason)
 
     def doubt_brownout(self, reason: str) -> None:
@@ -294,20 +294,20 @@ class SupplyMonitor:
                arrived: float | None = None, *, again: bool = True,
                alone: bool = False) -> MonitorReport:
         """
-        Return what is known now.
+        Return the present results.
 
         Parameters
         ----------
         age : float or None
             Age of the newest voltage, s; None before the first one.
         now : float, optional
-            The clock by which the flag counts hold and delay, s; by default the stamp of the
+            Present time, s, by which the flag counts hold and delay; by default the stamp of the
             newest sample plus `age`.
         arrived : float, optional
             Time since the last voltage arrived, s, regardless of its stamp; by default `age`.
-            The floor counts arriving voltages.
+            A voltage at the floor counts as long as voltages arrive.
         again : bool
-            Whether to estimate again; if not, the numbers of the last report are kept, and only
+            Whether to estimate again; if false, the numbers of the last report are kept, and only
             floor, flag and ages are updated.
         alone : bool
             Whether only the risk is needed, not the budget.
@@ -341,22 +341,22 @@ class SupplyMonitor:
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
-                # Use the more accurate sigma of a longer window only if the short window shows
-                # an OU too; otherwise the load model is more accurate.
+                # Use sigma of a longer window, which is more accurate, only if the short window
+                # shows an OU too; otherwise the load model is more accurate.
                 self._forecast.follow(*((shown, ou.window_s, ou_age) if e.usable and shown.usable
                                         else (e, e.duration)))
                 self._ahead = look_ahead(
                     self._forecast, self._load, self._settings, alone=alone) if (
                         fresh) else RiskOutlook(budget_reason=why)
         except Exception as error:
-            # As in `push`.
+            # Catch every error, as in `push`.
             self.restart(error)
             e = Estimate(counters=self._counters())
             limit, stamps, fresh = self._settings.stale_after, StampOrder.GOOD, False
             doubt, why = Doubt.NONE, ''
             self._ahead = RiskOutlook()
             shown, ou, ou_age = e, of_estimate(e), 0.0
-        # The risk always uses the sliding estimate of the last seconds.
+        # Keep the sliding estimate; report the one that is shown.
         self._newest, e = e, shown
         ahead = self._ahead
         risk = ahead.outcome.risk
@@ -395,7 +395,7 @@ class SupplyMonitor:
         -------
         float
             Probability, including the pilot's future throttle; NaN without voltage, in the first
-            second, and if the input is not trusted.
+            second, or if the input is not trusted.
 
         Raises
         ------
@@ -411,7 +411,7 @@ class SupplyMonitor:
     def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
                 horizon: float | None = None) -> float:
         """
-        Return the risk, as `risk`, if throttle goes to `throttle`, stays, and returns.
+        Return the risk (see `risk`) if throttle goes to `throttle`, stays, and returns.
 
         Parameters
         ----------
@@ -430,7 +430,7 @@ class SupplyMonitor:
         Raises
         ------
         ValueError
-            When the throttle lies outside 0..1 or the dwell is negative, and as `risk` does.
+            When the throttle lies outside 0..1, the dwell is negative, or as in `risk`.
 
         """
         level, ahead = self._checked(voltage, horizon)
@@ -443,7 +443,7 @@ class SupplyMonitor:
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
 
     def changed_risk(self, sag: float, noise: float, voltage: float) -> FloatArray:
-        """Return the risks over throttle, (51,), with sag and noise variance multiplied."""
+        """Return the risks over throttle, (51,), if sag and noise variance change by factors."""
         level, ahead = self._checked(voltage, None)
         return risk_over_throttle(self._forecast, level, ahead, sag, noise)
 
@@ -462,7 +462,7 @@ class SupplyMonitor:
         return level, ahead
 
     def _estimate(self) -> Estimate:
-        """Return the newest estimate; IRREGULAR refers to the present window only."""
+        """Return the newest estimate; its IRREGULAR refers to the present window only."""
         e = self._estimator.estimate()
         counters = self._counters()
         odd = counters.late + counters.non_finite
@@ -524,7 +524,7 @@ class SupplyMonitor:
         return Level.OK, e.status.value
 
     def _default_limit_words(self) -> str:
-        """Return a caution if the default limit is used on a supply above a 5 V rail."""
+        """Return a caution if the default limit is used on a supply above 5 V rails."""
         limit, now = self._settings.brownout_voltage, self._forecast.voltage
         return (f'The limit is the default of {limit:g} V, for a 5 V rail, and the supply is at '
                 f'{now:.3g} V: set brownout.voltage.') if (
@@ -575,13 +575,13 @@ class MonitorReport:
     thinned: int
     restarts: int  # Restarts of the estimator after an error
     fault: str  # The last such error, in one line; empty when there was none
-    # Level, sag and noise under load; known even if no OU is visible.
+    # Level, sag and noise under load, which do not need a visible OU.
     load: SupplyLoad = SupplyLoad()
     # Method of the risk: ``first_passage``, ``load``, ``excursions`` or ``none``.
     risk_basis: str = 'none'
     # Main cause of the risk: noise, load now, or throttle to come; empty: unknown.
     risk_cause: str = ''
-    # Risk if throttle goes to each of `RISK_CURVE` and stays for the horizon; empty or NaN:
+    # Risk if throttle goes to each value of `RISK_CURVE` and stays for the horizon; empty or NaN:
     # unknown.
     risk_curve: tuple[float, ...] = ()
     ou: OuFacts = OuFacts('no_data')  # Relaxation or its bounds, and their window
@@ -590,7 +590,7 @@ class MonitorReport:
 
     @property
     def brownout(self) -> bool | None:
-        """Return the flag; None when not known."""
+        """Return the flag; None if it is unknown."""
         return self.flag.brownout
 
     @property
@@ -598,8 +598,8 @@ class MonitorReport:
         """
         Return every field as text, for diagnostics; numbers round-trip.
 
-        SI units; intervals are two numbers with a blank between them; `alpha_se`, `sigma_se` and
-        `var_inf_se` are of the logarithm, `u0_se` in V.
+        SI units; intervals are two numbers separated by a blank; `alpha_se`, `sigma_se` and
+        `var_inf_se` are errors of the logarithm, `u0_se` is in V.
         """
         e = self.estimate
         values: dict[str, object] = {

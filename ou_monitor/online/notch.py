@@ -1,44 +1,47 @@
 """
-Notches that follow the motors, by motor speeds or else by throttle, and are off if useless.
+Notches that follow the motors, by motor speeds or else by throttle, and switch off if useless.
 
 samples -> spectra of frames -> law (throttle to frequency) and choice (which notches, or none)
 -> frequency, width and depth of each notch, sample by sample -> output.
 
 **Law** for unknown motor speeds: f = a + b sqrt(u), learned from the noise.  The thrust of a motor
-in hover is proportional to its speed squared, so f is proportional to the square root of throttle
-u if the controller's throttle is a thrust, with an offset otherwise.  The candidates are all pairs
-of a frequency at `LOW` and one at `HIGH`; the score of each is the share of the past noise (old
-frames are forgotten) that a notch at its frequency would have removed.  The highest score wins.
-(A law fitted to the median of the peaks would follow the most frequent peak, not the strongest.)
+in hover is proportional to its speed squared.  So f is proportional to the square root of throttle
+u if the controller's throttle is a thrust; otherwise, there is an offset.  The candidates are all
+pairs of a frequency at `LOW` and one at `HIGH`; the score of each is the share of the past noise
+(old frames are forgotten) that a notch at its frequency would have removed.  The highest score
+wins.  (A law fitted to the median of the peaks would follow the most frequent peak, not the
+strongest.)
 
 **Choice** of notches in each channel: least noise in a D term at equal lag.  The noise of a
 candidate is the power of the derivative above `fmin` after its notches and a low-pass of order 2,
-whose cutoff is raised until both together lag as much as the low-pass alone.  It is computed for
-this low-pass, a slower and a faster one, for each frame before the law learns from the frame, and
-averaged.  A channel uses the best candidate if less than `_ON` of the rms without notches remains,
-and none of the low-passes has more noise than without; it changes to a candidate that has a tenth
-less power.  It switches off if `_OFF` or more remains, or any low-pass has more noise.
+whose cutoff is raised until both together lag as much as the low-pass alone.  This is computed for
+a low-pass at `cutoff`, a slower and a faster one, for each frame before the law learns from the
+frame, and averaged.  A channel uses the best candidate if less than `_ON` of the rms without
+notches remains, and if the candidate has less noise with each of the low-passes.  It changes to
+another candidate that has a tenth less power.  It switches off if `_OFF` or more remains, or if
+the candidate does not have less noise with each low-pass.
 
 Limits: only lines that follow the motors are removed, and motor speeds or throttle are needed.
-The law does not resolve speeds of single motors.  Lines above half the sample rate are not
-followed: their aliases fall with throttle.  A change of the vehicle is learned in half a minute.
-A frame with a gap of more than five intervals is dropped; smaller unevenness is interpolated.
+The law does not resolve the speeds of single motors.  Lines above half the sample rate are not
+followed, because their aliases fall as throttle rises.  A change of the vehicle is learned in half
+a minute.  A frame with a gap of more than five intervals is dropped; with less uneven stamps, it
+is interpolated.
 
 **Filters**: state-variable filters whose coefficients may change.  With w = 2 pi f and
 k = bandwidth / f, one notch of depth m is
 
     s1' = w (x - s2 - k s1),  s2' = w s1,  y = x - m k s1
 
-by the trapezoidal rule with g = tan(pi f dt), so that the zero lies on f exactly
+by the trapezoidal rule with g = tan(pi f dt), so that the zero lies exactly at f
 (Zavalishin, The Art of VA Filter Design, 2012, ch. 4; Simper 2013):
 
     v1 = (g (x - s2) + s1) / (1 + g (g + k)),  v2 = s2 + g v1,  s <- 2 v - s.
 
-A step of the coefficients is a step of y, so the caller changes them smoothly.
+A step of the coefficients causes a step of y, so the caller changes them smoothly.
 
 The filter is stable under any sequence of f, k and m: with K the smallest k, P = [[1, e], [e, 1]]
-and e < 4 K / (4 + K^2), s^T P s is a Lyapunov function for every k in K..2; m is outside the loop.
-test_biquads.py computes the bound of the state; adversarial sequences reach a tenth of it.
+and e < 4 K / (4 + K^2), s^T P s is a Lyapunov function for every k in K..2, and m is outside the
+loop.  test_biquads.py computes a bound of the state; adversarial sequences reach a tenth of it.
 """
 
 from __future__ import annotations
@@ -55,13 +58,13 @@ from ou_monitor.online.filter.lowpass import FilterCounters, LARGEST, LATEST, SH
 from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray, NAN
 
-# Speeds count as frozen if they stay constant for this many mean intervals between changes and for
-# this time, s, after at least this many changes: no motor holds its speed to the last digit.
+# Speeds count as frozen if, after at least _CHANGES changes, they stay constant for _FROZEN mean
+# intervals between changes, and for _STUCK seconds: no motor holds its speed to the last digit.
 _CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
 
 
 class NewestSpeeds:
-    """Newest speeds of the motors (per_unit: Hz per unit received; stale_after in s)."""
+    """Newest motor speeds (per_unit: Hz per unit of the values received; stale_after in s)."""
 
     def __init__(self, per_unit: float, stale_after: float) -> None:
         self._per_unit, self._stale_after = per_unit, stale_after
@@ -90,7 +93,7 @@ class NewestSpeeds:
         self._speeds, self._received = speeds, t
 
     def now(self, t: float, most: int) -> list[float]:
-        """Return the speeds of up to `most` groups of motors, Hz; empty: unknown."""
+        """Return the mean speeds of up to `most` groups of motors, Hz; empty: unknown."""
         if not most or not t - self._received <= self._stale_after:
             return []
         if self._changes >= _CHANGES:
@@ -110,13 +113,13 @@ class NewestSpeeds:
 
 # Square roots of throttle at which candidate laws are defined, within the usual range.
 LOW, HIGH = 0.4, 0.85
-_GRID = 48  # Number of frequencies at each of them
-# Bandwidth over frequency of the notch by which laws are scored.
+_GRID = 48  # Number of frequencies at each of these
+# Bandwidth over frequency of the notch with which laws are scored.
 _WIDTH = 0.5
-# Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
+# Memory of frames, s; as a pack empties, the speed at a throttle falls within minutes.
 _LAW_MEMORY = 30.0
-# Prior score of the laws: share of noise removed by f ~ sqrt(u), weight in frames, and standard
-# deviation of a / f(HIGH).
+# Prior score of the laws: share of the noise removed by f ~ sqrt(u); its weight, in frames;
+# standard deviation of a / f(HIGH).
 _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
@@ -135,7 +138,7 @@ class MotorLaw:
         self._prior: FloatArray = _FRAMES * _PRIOR * np.exp(
             -0.5 * (self._a / (_SPREAD * high))**2)
         self._found: FloatArray = np.zeros_like(low)
-        # Widen the grid by rounding errors, because a law may end at its ends.
+        # Widen the grid a little, so that rounding does not exclude laws that reach its ends.
         self._log: FloatArray = np.log(grid)
         self._log[[0, -1]] += -1e-3, 1e-3
         self.a = self.b = np.nan
@@ -146,7 +149,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """Take a frame, `passed` s after the last one; lost: factor on the earlier scores."""
+        """Take a frame, `passed` s after the last one; lost: further factor on old scores."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -157,10 +160,11 @@ class MotorLaw:
         self.a, self.b = float(self._a[best]), float(self._b[best])
 
 
-# Length and distance of frames, s: throttle changes little within one, and it resolves 4 Hz.
+# Length and distance of frames, s: throttle changes little within a frame, which resolves 4 Hz.
 FRAME, HOP = 0.25, 0.0625
-_SMALLEST, _LONGEST = 16, 4096  # Samples in a frame
-_MISSING, _UNEVEN = 5.0, 0.3  # Intervals: gap that restarts a frame; deviation that is resampled
+_SMALLEST, _LONGEST = 16, 4096  # Minimum and maximum number of samples in a frame
+# Gap that restarts a frame, and deviation from even spacing that needs resampling, in intervals.
+_MISSING, _UNEVEN = 5.0, 0.3
 
 
 class NotchFrames:
@@ -204,23 +208,25 @@ class NotchFrames:
 
 # Candidate bandwidths relative to the frequency.
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
-# Cutoffs of the low-passes after the notches, over `cutoff`; their maximum, over the sample rate.
+# Cutoffs of the low-passes after the notches, relative to `cutoff`; their maximum, relative to the
+# sample rate.
 _BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
-# Maximum remaining share of the rms to switch on, to stay on, and for each single low-pass; share
-# of the present candidate's power below which another is chosen.
+# Maximum share of the rms that may remain, to switch on, to stay on, and with each low-pass; share
+# of the present candidate's power below which another candidate is chosen.
 _ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
-# Memory of the noise and of the loudest frame, s; frames before the first decision.
+# Memory of the noise, and of the loudest frame, s; number of frames before the first decision.
 _MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
-# Minimum share of the lag left to the low-pass, in a frame (one ten times as fast hardly filters)
-# and in the mean of frames.
+# Minimum share of the lag that remains for the low-pass, in a frame (with less, the low-pass
+# hardly filters) and on average.
 _LEAST, _LEAST_MEAN = 0.1, 0.4
-# Frames are weighted by power to this exponent (amplitude); by power, a crash would dominate.
+# Exponent of power in the weight of a frame: weights by amplitude, because with weights by power a
+# crash would dominate.
 _BY_AMPLITUDE = 0.5
 _TINY = 1e-300
 
 
 class Candidate(NamedTuple):
-    """Notches that may be chosen: one at the frequency of the law, or one at each motor's."""
+    """Notches that may be chosen: one at the law's frequency, or one at each motor's frequency."""
 
     source: str
     width: float  # Bandwidth over frequency
@@ -230,7 +236,7 @@ SOURCES = ('throttle', 'rpm')
 
 
 class NotchChoice:
-    """Choice of a candidate for each channel; `chosen`: by channel, None: no notch."""
+    """Choice of a candidate for each channel; `chosen`: the candidates, None: no notch."""
 
     def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,
                  channels: int) -> None:
@@ -239,7 +245,7 @@ class NotchChoice:
         self._used = frequencies >= self._fmin
         self._warped: FloatArray = np.tan(
             np.pi * np.minimum(frequencies[self._used] / rate, 0.499))
-        # Low-passes by the bilinear transform.
+        # Low-passes are discretised by the bilinear transform.
         at = np.tan(np.pi * np.minimum(cutoff / rate * np.array(_BEHIND), _FASTEST))
         self._fourth: FloatArray = (self._warped[None, :] / at[:, None])**4
         self._lag: FloatArray = np.sqrt(2.0) / (2.0 * rate * at)
@@ -254,8 +260,8 @@ class NotchChoice:
 
     def normalise(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
         """Return a frame relative to the loudest recent power, and a factor on earlier frames."""
-        # A louder frame reduces the weight of earlier ones; quiet frames regain weight as loud
-        # ones are forgotten.
+        # A louder frame reduces the weight of earlier frames; quiet frames regain weight as loud
+        # frames are forgotten.
         before = self._loudest * np.exp(-passed / _LEVEL)
         self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
         lost = (before / np.maximum(self._loudest, _TINY))**_BY_AMPLITUDE
@@ -272,7 +278,7 @@ class NotchChoice:
     def take(self, power: FloatArray, throttle: float, motors: FloatArray,
              passed: float) -> None:
         """Take a frame: power, shape (channels, K), `passed` s after the last one."""
-        # throttle: frequency by the law, Hz, NaN if unknown; motors: their frequencies, Hz.
+        # throttle: frequency of the law, Hz, NaN if unknown; motors: their frequencies, Hz.
         power = power[:, self._used]
         none = power @ self._low.T
         for j, f in enumerate((np.array([throttle]), motors)):
@@ -298,7 +304,7 @@ class NotchChoice:
         return passes, WIDTHS * float(np.sum(0.5 / (self._rate * at)))
 
     def decide(self, sources: set[str]) -> None:
-        """Choose for each channel among the candidates whose source is available now."""
+        """Choose, for each channel, among the candidates whose source is available now."""
         known = np.array([source in sources and frames >= _FEWEST for source, frames in
                           zip(SOURCES, self._frames, strict=True)])
         left = self._noise / np.maximum(self._without, _TINY)
@@ -321,11 +327,11 @@ class NotchChoice:
                 self.chosen[c] = None
 
 
-# Minimum gap, in intervals; number of samples that determine the interval; minimum relative change
-# of the interval that counts as a new rate.
+# Minimum length of a gap, in intervals; number of samples that determine the interval; relative
+# change of the interval above which the rate is new.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
-# Time constants, s: motors after a step of throttle (25 ms on a 5 inch propeller); changes of a
-# notch's depth, width and frequency.
+# Time constant of the motors after a step of throttle (25 ms with a 5 inch propeller); time in
+# which a notch fades in or out; time constants of its width and of its frequency, s.
 _SPIN_UP, _FADE, _WIDEN, _MOVE = 0.03, 0.2, 0.05, 0.004
 # Time for which the last throttle is held, s.
 _HELD = 1.0
@@ -374,7 +380,8 @@ class AdaptiveNotch:
         self._frames: NotchFrames | None = None
         self._law: MotorLaw | None = None
         self._choice: NotchChoice | None = None
-        # Square root of throttle after the lag of the motors, and time of the last throttle.
+        # Square root of throttle after the lag of the motors, and as received; stamp of the last
+        # throttle, s.
         self._root, self._newest_root, self._received = NAN, NAN, -math.inf
         self._motors: list[float] = []
         self._sources: set[str] = set()
@@ -386,12 +393,12 @@ class AdaptiveNotch:
 
     @property
     def active(self) -> bool:
-        """Whether any notch is in force in any channel."""
+        """Whether a notch is in use in any channel."""
         return any(one.depth > 0.0 for bank in self._banks for one in bank)
 
     @property
     def frequencies(self) -> FloatArray:
-        """Frequencies of the notches in the channel with the most of them, Hz; empty: none."""
+        """Frequencies of the notches in the channel with the most notches, Hz; empty: none."""
         rate = self.rate
         each = [[one.ratio * rate for one in bank if one.depth > 0.0] for bank in self._banks]
         return np.array(max(each, key=len, default=[]), dtype=np.float64)
@@ -415,12 +422,12 @@ class AdaptiveNotch:
 
     @property
     def delay(self) -> float:
-        """Phase delay of the notches in force at 10 Hz, s, in the channel where it is largest."""
+        """Phase delay of the notches at 10 Hz, s, in the channel where it is largest."""
         return max(self.delays(_LAG_FREQUENCY), default=0.0)
 
     def delays(self, frequency: float) -> list[float]:
         """
-        Return the phase delay of the notches in force in each channel, s.
+        Return the phase delay of the notches in each channel, s.
 
         frequency in Hz.
         """
@@ -431,7 +438,7 @@ class AdaptiveNotch:
 
     def configure(self, **options: object) -> None:
         """
-        Change options; the output does not jump, and what was learned is kept if it still applies.
+        Change options; the output does not jump, and learned values are kept if they still apply.
 
         Raises
         ------
@@ -457,7 +464,7 @@ class AdaptiveNotch:
         x : float or array_like, shape (n,) or (n, channels)
             Signal, any unit.  A sample with NaN is counted and does not change the output.
         throttle : float or array_like, shape (n,), optional
-            Throttle, 0..1; NaN: the last finite one is used, for a second.
+            Throttle, 0..1; for NaN, the last finite value is used, for a second.
         rpm : array_like, shape (n,) or (n, motors), or (motors,) with one number t, optional
             Motor speeds, in `rpm_unit`; NaN: not received.
 
@@ -623,7 +630,7 @@ HIGHEST = 0.45
 
 
 class Notch:
-    """One notch of one channel; it starts as if the input had always been x."""
+    """One notch of one channel, starting as if the input had always been x."""
 
     __slots__ = ('_g', '_ratio', '_s1', '_s2', 'depth', 'width')
 
@@ -658,7 +665,7 @@ class Notch:
         return x - self.depth * k * v1
 
     def response(self, ratio: float) -> complex:
-        """Return the response to a frequency over the sample rate, with constant coefficients."""
+        """Return the response at a frequency over the sample rate, for constant coefficients."""
         if not self._g:
             return 1.0 + 0.0j
         p = 1j * math.tan(math.pi * ratio) / self._g

@@ -2,13 +2,14 @@
 Alpha, sigma and Var_inf online: `SlidingEstimator`, and `RelaxationFits` for `window: auto`.
 
 voltage = level + response to throttle + OU(alpha, sigma) + white noise, all estimated together.
-doc/estimation.md has the steps, the measured accuracy and the limits.  The window begins anew if a
-change of the source's rate changes the number of samples per block.
+doc/estimation.md has the steps, the measured accuracy and the limits.  If a change of the source's
+rate changes the number of samples per block, the window is cleared.
 
-`RelaxationFits` keeps the readings of a minute, fitted by `known_ou` of `ou_fit`.  A fit costs 30
-to 600 ms of CPU, so it is repeated only after a quarter of its window, at least 1 s; in the
-background it runs in a thread that takes at most 5 % of a core.  Limits: as in `ou_fit`; above
-1 kHz, only the last 65 536 readings are kept; a change of the supply is followed one window late.
+`RelaxationFits` keeps the readings of the last minute, and fits them by `known_ou` of `ou_fit`.  A
+fit takes 30 to 600 ms of CPU, so it is repeated only after a quarter of its window, and after 1 s
+at least.  In the background, fits run in a thread, with at most 5 % of a core.  Limits: as in
+`ou_fit`; above 1 kHz, only the last 65 536 readings are kept; a change of the supply is followed
+one window late.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ from ou_monitor.timeline import as_column, BATCH, Batch, TAIL, TimeLine
 # Time constants, s, with which the load may follow throttle: motors follow the command within
 # 5 to 20 ms, and the current settles within 40 ms (doc/estimation.md).
 LOAD_LAGS = (0.010, 0.040)
-# After this long without a change of throttle all lags have settled, s.
+# Time after a change of throttle within which all lags settle, s.
 LOOK_BACK = 16.0 * LOAD_LAGS[1]
 
-# Maximum exponent; exp(_SPAN) is far below the largest double.
+# Maximum exponent; even exp(2 * _SPAN) is far below the largest double.
 _SPAN = 300.0
 # Difference from the throttle below which a lagged throttle has settled.
 _SETTLED = 1e-7
-# Minimum samples to determine the rate.
+# Minimum number of samples to determine the rate.
 MIN_FOR_RATE = 8
-# A step that differs from the usual step by more than this share ends a run of even steps.
+# Relative difference from the usual step above which a step ends a run of even steps.
 UNEVEN = 0.5
-# The usual step is updated when the median step of recent stamps differs by this factor.
+# The usual step is updated when the median step of recent stamps differs from it by this factor.
 NEW_RATE = 1.3
 # Number of stamps kept from batch to batch for that median.
 MEMORY = 32
@@ -53,19 +54,20 @@ MEMORY = 32
 MOST_BLOCK = 1000.0
 # Minimum number of samples for a fit.
 MIN_SAMPLES = 20
-# Minimum length of a run of evenly spaced readings, and share of such readings below which the
-# window counts as uneven.
+# Minimum length of a run of evenly spaced readings (and longest lag of increments); share of
+# readings in such runs below which the window counts as uneven.
 _LAGS, _EVEN = 24, 0.5
-# Jitter of the stamps, in relaxation times, above which exact stamps are used: the error due to an
-# even grid is the square of the jitter.
+# Jitter of the stamps, in relaxation times, above which exact stamps are used, because an even
+# grid causes an error of the square of the jitter.
 _JITTER = 0.1
 # Tolerance for rounded stamps at the edge of the window, as a share of the window.
 _ROUNDING = 1e-6
-# If the variance of increments is below this share of their mean square, the voltage is a ramp.
+# Share of their mean square below which the variance of increments shows that the voltage is a
+# ramp.
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
 _LOOKS = 4
-# Window of the sliding estimate for `window: auto`, beside `RelaxationFits`, s.
+# Window of the sliding estimate that complements `RelaxationFits` for `window: auto`, s.
 SLIDING = OU_WINDOWS[0]
 # Time between two fits, as a share of the window, and its minimum, s.
 _SHARE, _SOONEST = 0.25, 1.0
@@ -73,7 +75,7 @@ _SHARE, _SOONEST = 0.25, 1.0
 _CPU = 0.05
 # Statuses of an estimate without a relaxation whose window is too short for a fit.
 _SHORT = (Status.TOO_FEW_SAMPLES, Status.TOO_SHORT)
-# Cautions that concern the model of the sliding estimate, but not `RelaxationFits`.
+# Cautions about the sliding estimate that do not apply to `RelaxationFits`.
 _SLIDING_ONLY = frozenset({Flag.TREND, Flag.SLOW_RATE})
 
 
@@ -86,8 +88,8 @@ class SlidingEstimator:
     window : float
         Length of the window, s, > 0.
     fastest : float
-        Highest rate kept, Hz; sources faster than this are averaged in blocks, which the fit
-        allows for.
+        Highest rate kept, Hz; faster sources are averaged in blocks, and the fit accounts for
+        that.
 
     Raises
     ------
@@ -156,8 +158,9 @@ class SlidingEstimator:
         Parameters
         ----------
         t : float or array_like, shape (n,)
-            Stamps, s.  Late samples are sorted within one call, else dropped and
-            counted; a step back or a pause longer than the window clears it.
+            Stamps, s.  Late samples are sorted within one call, otherwise dropped
+            and counted.  A step back, or a pause longer than the window, clears
+            the window.
         voltage : float or array_like, shape (n,)
             Voltage, V.  NaN and infinite samples are dropped and counted.
         throttle : float or array_like, shape (n,), optional
@@ -211,7 +214,7 @@ class SlidingEstimator:
         if batch.restart:
             self._forget()
         if batch.again:
-            # Discard block means, because repeats cannot be removed from them.
+            # Discard the block means, because repeats cannot be removed from them.
             self._thinner = BlockAverager(self._fastest)
             self._kept = ReadingBuffer(3)
             self._tail = np.empty(0)
@@ -235,13 +238,13 @@ class SlidingEstimator:
         self._before = None
 
     def _slide(self) -> None:
-        """Move the window to the newest reading; readings that leave it do not come back."""
+        """Move the window to the newest reading; its begin never moves back."""
         t = self._kept.columns[0]
         if t.size:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _ROUNDING) * self._window)
 
     def _examine(self, t: FloatArray) -> Quality:
-        """Examine the raw samples, several times per window."""
+        """Return the quality of the raw samples, examined again several times per window."""
         if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail, self._line.period)
             steps = np.diff(t[-TAIL:])
@@ -280,7 +283,7 @@ class SlidingEstimator:
             return Estimate(status=status, u0=float(y.mean()),
                             flags=tuple(input_flags(counters, quality, NAN)),
                             **measured)
-        # Regress on throttle and its lags if any of them moves, but not if throttle is unknown.
+        # Regress on throttle and its lags if throttle is known and has moved.
         known = not np.isnan(u).any()
         back = int(kept[0].searchsorted(t.item(0) - LOOK_BACK))
         before = kept[2, back:]
@@ -306,7 +309,7 @@ class SlidingEstimator:
             jitters = math.isfinite(a) and self._jitter * a / step > _JITTER
             return bool(m == 1 and t.size <= MOST and (uneven or jitters))
 
-        # If two windows share half of their samples, their fits are similar.
+        # If two windows have half of their samples in common, their fits are similar.
         near = t.item(t.size // 2) < self._before_end
         before = self._before if near else None
         fit, self._before = fit_window(t, y, load, m, quality.step, stamps, before)
@@ -317,10 +320,10 @@ class SlidingEstimator:
         smoothness = NAN
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
-        # Also set the trend if the drift is faster than a random walk with these increments: if
-        # the voltage does not return within the window, the fit may attribute any drift to chance.
-        # Increments over the longest lag reveal movements in one direction.  This is only for
-        # constant throttle, because moving throttle is regressed out.
+        # Also report a trend if the voltage drifts faster than a random walk with these
+        # increments: if it does not return within the window, the fit may take any drift for
+        # chance.  Increments over the longest lag reveal movements in one direction.  Skip this if
+        # throttle moves, because the sag is still in these increments.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
             fit = replace(fit, trend=True)
@@ -328,9 +331,9 @@ class SlidingEstimator:
 
 
 def _smoothness(ratio: float, a: float, m: int) -> float:
-    """Return the correlation of neighbouring increments in excess of an OU's."""
-    # ratio: D_2 / D_1.  From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
-    # squared, their correlation is D_2 / (2 D_1) - 1.
+    """Return by how much the correlation of neighbouring increments exceeds an OU's."""
+    # ratio: D_2 / D_1, the variances of z_j - z_{j-2} and z_j - z_{j-1}; the correlation of
+    # neighbouring increments is D_2 / (2 D_1) - 1.
     gamma0, gamma1 = arma.block_autocovariance(a, m)
     of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
     return 0.5 * ratio - 1.0 - of_ou
@@ -354,7 +357,7 @@ def _positive(name: str, value: float, unit: str) -> float:
 
 
 class ReadingBuffer:
-    """The newest readings in columns; row 0 holds the stamps, s.  Old ones are dropped."""
+    """The newest readings, one per column; row 0 holds the stamps, s."""
 
     def __init__(self, rows: int) -> None:
         self._store = np.empty((rows, 1024))
@@ -370,10 +373,10 @@ class ReadingBuffer:
         self._size = size
 
     def append(self, columns: FloatArray, reach: float, most: int = 1 << 62) -> None:
-        """Add readings; keep those of the last `reach` seconds, but no more than `most`."""
+        """Add readings; keep at least the last `reach` seconds of them, or the last `most`."""
         count = columns.shape[1]
         if self._size + count > self._store.shape[1]:
-            # Keep one more, which shows that there are data before the window.
+            # Keep one reading more, which shows that there are data before the window.
             first = max(0, int(np.searchsorted(
                 self.columns[0], columns[0, -1] - reach)) - 1, self._size + count - most - 1)
             old = self.columns[:, first:]
@@ -418,7 +421,7 @@ def lagged(t: FloatArray, u: FloatArray, tau: float) -> FloatArray:
 
 
 class BlockAverager:
-    """Measures the rate of the source, and averages blocks if it exceeds `fastest`, Hz."""
+    """Measures the rate of the source; averages in blocks if the rate exceeds `fastest`, Hz."""
 
     def __init__(self, fastest: float) -> None:
         self._fastest = fastest
@@ -427,7 +430,7 @@ class BlockAverager:
         self.forget()
 
     def forget(self) -> None:
-        """Treat the next samples as the first, but keep the rate."""
+        """Treat the next sample as the first, but keep the rate."""
         self._rest = np.empty((3, 0))
         self._stamps = np.empty(0)
 
@@ -437,7 +440,7 @@ class BlockAverager:
         return stamps[stamps >= since]
 
     def take(self, batch: Batch) -> tuple[FloatArray, bool]:
-        """Return stamps, voltage and throttle to keep, and whether they begin anew."""
+        """Return stamps, voltage and throttle to keep; whether to discard the earlier ones."""
         t = batch.t
         columns = batch.columns[:3]
         restart = False
@@ -484,12 +487,12 @@ class BlockAverager:
 
 
 class RelaxationFits:
-    """Readings of the last minute, and the newest fit of them; `end`: its last stamp, s."""
+    """Readings of the last minute, and their newest fit; `end`: last stamp of the fit, s."""
 
     def __init__(self, *, background: bool) -> None:
         self._background = background
         self._thread: threading.Thread | None = None
-        # Result of the thread: its time line, the fit or the error, and the end of the readings.
+        # Result of the thread: number of its time line, the fit or the error, and last stamp, s.
         self._found: tuple[int, OuFacts | Exception, float] | None = None
         self._line = 0
         self._rest = -math.inf
@@ -497,7 +500,7 @@ class RelaxationFits:
 
     def forget(self) -> None:
         """Forget all readings."""
-        # Stamp, voltage, throttle and current of each reading.
+        # Rows: stamp, voltage, throttle and current.
         self._kept = ReadingBuffer(4)
         self._line += 1
         self.facts: OuFacts | None = None
@@ -512,14 +515,14 @@ class RelaxationFits:
         """Take readings in order."""
         t = self.readings[0]
         if batch.again:
-            # The batch replaces the newest readings kept: it omits their repeats.
+            # The batch replaces the newest readings kept, without their repeats.
             self._kept.cut(int(np.searchsorted(t, batch.t[0])))
         elif t.size and batch.t[0] <= t[-1]:
             self.forget()
         self._kept.append(batch.columns[:, -MOST_READINGS:], OU_WINDOWS[-1], MOST_READINGS)
 
     def update(self) -> None:
-        """Fit if it is due; in the background, take the result of the thread."""
+        """Fit if a fit is due; in the background, start the thread, and take its last result."""
         if self._found is not None:
             (line, found, end), self._found = self._found, None
             if line == self._line:
@@ -548,7 +551,7 @@ class RelaxationFits:
 
     def _put(self, found: OuFacts | Exception, end: float) -> None:
         if isinstance(found, Exception):
-            # The monitor restarts, and reports the reason.
+            # The monitor then restarts, and reports the reason.
             raise found
         self.facts, self.end = found, end
         self._due = end + max(_SOONEST, _SHARE * found.window_s)
@@ -561,12 +564,12 @@ class RelaxationFits:
         later = not self.readings.size or self.readings[0, -1] > self.end
         if facts is None or e.status is Status.NO_DATA or (
                 later and sliding.status == 'ok' and facts.window_s < sliding.window_s):
-            # In the first seconds, the sliding window is longer than the window of the fit.
+            # In the first seconds, the sliding window may be longer than the window of the fit.
             return e, sliding, 0.0
         if facts.status in ('no_data', 'too_short'):
             return _unknown(e, Status.TOO_SHORT), facts, age
         if age > max(facts.window_s, SLIDING):
-            # The fit is too old, because fits are too slow.
+            # The fit is too old, because fits take too long.
             return _unknown(e, Status.TOO_SHORT), OuFacts('no_data'), age
         if facts.status == 'not_visible':
             return _unknown(e, Status.NO_RELAXATION), facts, age
@@ -583,7 +586,7 @@ class RelaxationFits:
 
 
 def of_estimate(e: Estimate) -> OuFacts:
-    """Return the relaxation of a sliding estimate; it has no bounds."""
+    """Return the relaxation of a sliding estimate, without bounds."""
     if e.usable:
         return OuFacts('ok', e.duration, e.alpha, e.interval('alpha'), e.sigma,
                        e.interval('sigma'), e.var_inf, e.interval('var_inf'))
@@ -598,7 +601,7 @@ def untimed(e: Estimate) -> Estimate:
 
 
 def _unknown(e: Estimate, status: Status) -> Estimate:
-    """Return an estimate without a relaxation; a usable one gets the given status."""
+    """Return an estimate without its relaxation; if it was usable, with the given status."""
     return replace(e, alpha=NAN, alpha_se=NAN, sigma=NAN, sigma_se=NAN, var_inf=NAN,
                    var_inf_se=NAN, status=status if e.usable else e.status)
 

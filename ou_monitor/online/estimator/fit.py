@@ -1,17 +1,17 @@
 """
 Fit OU parameters, noise and mean to the samples of a window.
 
-While throttle moves, sag with its curvature and lag, and if necessary a drift, are regressed out
-of the mean within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
+The sag with its curvature and lag, if throttle moves, and a drift, if it is significant, are
+regressed out within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
 
 Evenly spaced samples, or block means: `SpectralLikelihood`, the Whittle likelihood
 (model/whittle.py), which `window: auto` and `supply_facts` use too.
 
 Unevenly spaced samples: `StampLikelihood`, the exact Gaussian likelihood, equal to the Kalman
 filter's.  The inverse covariance Q of a sampled OU is tridiagonal, so the cost is O(n): the
-covariance is K = Q^-1 + nu I; with A = I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| -
-log|Q|.  The gradient needs only the elimination and the three diagonals of A^-1.  The search
-starts from a fit that treats the samples as evenly spaced, and takes a few evaluations.
+covariance is K = Q^-1 + nu I; with the tridiagonal A = I + nu Q, K^-1 = Q A^-1 and log|K| =
+log|A| - log|Q|.  The gradient needs only the elimination and the three diagonals of A^-1.  The
+search starts from a fit that treats the samples as evenly spaced, and takes a few evaluations.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ from ou_monitor.records import FloatArray
 # Minimum variance of a combination of load variables, relative to the largest; with less, the
 # window does not determine its coefficient.
 _UNSEEN = 1e-5
-# Minimum variance of a load variable, full scale squared; below it the variable is constant.
+# Minimum variance of a load variable, relative to full scale squared; below it, the variable
+# counts as constant.
 _STILL = 1e-12
-# Minimum correlation of adjacent samples, standard errors, for a fit.
+# Minimum correlation of adjacent samples for a fit, in standard errors.
 _CORRELATED = 4.0
-# Maximum of alpha times the step: above it, adjacent samples carry no information on the
-# relaxation.  Minimum number of relaxation times in the window: below it, a drift may be chance.
+# Maximum of alpha times the step, above which adjacent samples have no information on the
+# relaxation; minimum number of relaxation times in the window, below which a drift may be chance.
 _FASTEST, _DOUBTFUL = 4.6, 25.0
 
 
@@ -61,14 +62,15 @@ def independent(cov: FloatArray) -> FloatArray:
     return found
 
 
-# Score (standard errors) above which a trend is included: by chance once in 16 000 long windows.
+# Score (standard errors) above which a trend is included; chance exceeds it once in 16 000 long
+# windows.
 TREND_SCORE = 4.0
 # A window of few relaxation times looks like a trend more often, so the required score is
 # multiplied by 1 + 6/x, x = alpha T.  False trends remain in 1 % of windows with x of 4 to 13, and
 # in 5 % of random walks (apparent x of 16).  A drift of 8 standard deviations at x = 25 is missed
 # in one window of 12; with twice the constant, in one of 5.
 _FEW = 6.0
-# Score above which a fit with a trend is tried (by chance once in 22 windows).
+# Score above which a fit with a trend is tried; chance exceeds it once in 22 windows.
 SUSPECT = 2.0
 
 
@@ -84,15 +86,15 @@ class FitEnd(enum.Enum):
 class WindowFit:
     """Fitted parameters, before the correction for short windows."""
 
-    outcome: FitEnd  # Outcome; unless it is FOUND the numbers may be NaN
-    # 1/s and V/sqrt(s), as maximised.
+    outcome: FitEnd  # Outcome; unless it is FOUND, the numbers may be NaN
+    # Maximum-likelihood values, 1/s and V/sqrt(s).
     alpha: float
     sigma: float
     noise_var: float  # Variance of the white noise of one raw sample, V^2
     noise_score: float  # Distance of the noise from zero, in standard errors
     log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
     level: FloatArray  # Means of voltage and load variables; shape (c,)
-    # Load coefficients, V per unit, and covariance, V^2.
+    # Coefficients of load and trend, V per unit, and their covariance, V^2.
     beta: FloatArray
     beta_cov: FloatArray
     trend: bool  # Whether the mean drifts
@@ -103,22 +105,23 @@ class WindowFit:
 
 # Relaxation times after which two samples are independent; exp(2 * 300) does not overflow.
 _FAR = 300.0
-# Size at which a tridiagonal system is solved as a dense one, which needs fewer NumPy calls.
+# Size up to which a tridiagonal system is solved as a dense one, which needs fewer NumPy calls.
 _DENSE = 24
-# Minimum gain of a step, nats: the optimum is then within 1e-4 standard errors, for any start.
+# Minimum gain of a step, nats, with which the result is within 1e-4 standard errors of the
+# optimum, for any start.
 _SETTLED = 1e-9
-# Maximum evaluations of a fit after the first; 4 to 8 are usual, more if alpha and noise cannot be
-# distinguished.
+# Maximum number of evaluations of a fit after the first; 4 to 8 are usual, and more are needed if
+# alpha and noise cannot be distinguished.
 _MOST_POINTS = 24
-# Steps in ln a and z of finite differences of slopes (error 1e-4 for unit curvature, rounding
-# 1e-7), and of finite differences of values.
+# Steps, in ln a and z, for finite differences of slopes (error 1e-4 for unit curvature, rounding
+# 1e-7) and for finite differences of values.
 _STEP, _HAIR = 1e-4, 1e-3
-# Points of the first grid of a search, in ln a and z.
+# Number of points of the initial grid of a search, in ln a and z.
 _GRID = (16, 8)
-# Minimum curvature of a direction, nats; maximum step.
+# Minimum curvature in any direction, nats; maximum step.
 _FLAT, _LONGEST = 1e-3, 1.5
-# White noise relative to the diffusion of one step: z is linear in it up to the first value, and
-# logarithmic above; the second is the upper limit of z (noise of 1e4, which hides any OU).
+# White noise relative to the diffusion of one step up to which z is linear in the noise (above it,
+# z is logarithmic); upper limit of z (for relative noise of 1e4, which hides any OU).
 _SMALL = 0.05
 _LOUDEST = math.log1p(1e4 / _SMALL)
 
@@ -155,7 +158,7 @@ class _Likelihood(Protocol):
 
 
 def _ends(n: int) -> tuple[FloatArray, FloatArray]:
-    """Return limits of ln a and z: from a relaxation of ten windows to no correlation."""
+    """Return limits of ln a and z: from a relaxation time of ten windows to no correlation."""
     return np.array([math.log(0.1 / (n - 1)), 0.0]), np.array([math.log(2.0 * _FASTEST), _LOUDEST])
 
 
@@ -171,14 +174,15 @@ class SpectralLikelihood:
         """Return the spectra of OU and noise in units of sigma^2, shape (k, bins)."""
         gamma = np.array([arma.block_autocovariance(math.exp(x), self.m) for x in log_a.tolist()])
         a = np.exp(log_a)
-        # Block means have the covariances of an OU of variance `size`, but less variance.
+        # Different block means have the covariances of an OU of variance `size`, but each has less
+        # variance.
         size = gamma[:, 1] * np.exp(a)
         white = gamma[:, 0] - size + _SMALL * np.expm1(z)
         return np.asarray(self.step * (
             size[:, None] * self._cross.ou(a[:, None]) + white[:, None]))
 
     def at(self, log_a: float, z: float, used: int) -> _Point:
-        """Return the likelihood with the first `used` regressors, see `StampLikelihood.at`."""
+        """Return the likelihood with the first `used` regressors; see `StampLikelihood.at`."""
         value, scale, gram = self._cross.cost(self._spectra(
             log_a + _HAIR * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),
             z + _HAIR * np.array([0.0, 0.0, 0.0, 1.0, -1.0])), used)
@@ -196,7 +200,7 @@ class SpectralLikelihood:
 
 
 class StampLikelihood:
-    """Exact likelihood of samples at stamps, s; rows: regressors, and voltage, V, as the last."""
+    """Exact likelihood of samples at stamps, s; rows: regressors, then the voltage, V."""
 
     def __init__(self, t: FloatArray, rows: FloatArray) -> None:
         self.steps = np.diff(t)
@@ -223,7 +227,8 @@ class StampLikelihood:
         q[:, 1:] += off * w[:, :-1]
         q[:, :-1] += off * w[:, 1:]
         gram = double * (self._table @ q.T)
-        # Derivatives of the products and of log|K| by ln alpha (constant noise), and by the noise.
+        # Derivatives of the products and of log|K| by ln alpha (at constant noise) and by the
+        # noise.
         d_h = -2.0 * x * off * off
         d_diag = diag.copy()
         d_diag[1:] += d_h
@@ -235,7 +240,7 @@ class StampLikelihood:
         log_slow = nu * float(inner @ d_diag + 2.0 * (beside @ d_off)) - self.n - float(
             np.sum(d_h / (1.0 + h)))
         log_white = double * float(inner @ diag + 2.0 * (beside @ off))
-        # Profiled over mean and scale.
+        # Maximise over mean and scale.
         free = self.n - used
         own = gram[:used, :used]
         inverse = np.linalg.pinv(own, hermitian=True)
@@ -306,7 +311,7 @@ def _interleave(even: FloatArray, odd: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Maximum:
-    """Result of `maximise`; no bias correction."""
+    """Result of `maximise`, without bias correction."""
 
     # Relaxation rate, 1/s; noise intensity, V/sqrt(s); variance of the white noise, V^2, of a
     # sample or block mean.
@@ -326,13 +331,13 @@ class Maximum:
     share: float
     # Products of all rows at the maximum, see `_Point`.
     gram: FloatArray
-    # ln a and z at the maximum, and the curvature, nats, from which the next search starts.
+    # ln a and z at the maximum, and the curvature there, nats, for starting the next search.
     place: FloatArray
     curved: FloatArray | None
 
 
 def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) -> Maximum:
-    """Fit rate, noise and mean, of `used` regressors (before: fit of a nearly equal window)."""
+    """Fit rate, noise and a mean of `used` regressors (before: fit of a nearly equal window)."""
     low, high = likelihood.low, likelihood.high
     place, at, curved = _minimised(
         lambda p: likelihood.at(p.item(0), p.item(1), used),
@@ -340,7 +345,7 @@ def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) 
         None if before is None else before.curved, low, high)
     log_a, z = place.tolist()
     a, share = math.exp(log_a), _SMALL * math.expm1(z)
-    # The likelihood is flat at the slow end, so values within 5 % of it count as the end.
+    # The likelihood is flat at the slow end, so values within 5 % of this end count as the end.
     edge = -1 if log_a < low[0] + 0.05 else 1 if a > _FASTEST else 0
     return Maximum(a / likelihood.step, math.sqrt(at.scale), share * at.scale * likelihood.step,
                    at.beta, at.cov, -at.value, edge, a, share, at.gram, place, curved)
@@ -390,23 +395,24 @@ def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: Floa
     return here, at, curved
 
 
-# Samples up to which the exact likelihood is used.
+# Maximum number of samples for which the exact likelihood is used.
 MOST = 4096
-# Minimum share of the variance of time that the load does not explain, to fit a trend.
+# Minimum share of the variance of time that the load leaves unexplained, for fitting a trend.
 _APART = 1e-5
-# Samples averaged into one of a coarser grid, and minimum number of samples on that grid.
+# Number of samples averaged into one sample of a coarser grid; minimum number of samples on that
+# grid.
 _FACTOR, _FEWEST = 4, 100
 # An ADC step acts as white noise only if the OU crosses several codes between two samples, which
 # must be at least (0.7 step / sigma)^2 s apart (doc/estimation.md).
 _DITHER = 0.7
 # Correction of the bias of alpha, in 1/T, for the spectral likelihood and for the exact one.  The
 # exact restricted likelihood makes alpha too high by 2/T (Tang & Chen, J. Econometrics 149 (2009)
-# 65: 4/T with unknown mean, half of it from the mean), the spectral one by 0.1 to 1.2/T, or 1.6 to
-# 2.5/T with 5 mV of noise (600 simulated windows each of 12 to 126 relaxation times).  Var_inf =
-# sigma^2 / (2 alpha) is convex in alpha, so one correction for both is a compromise: it leaves
-# Var_inf too high by 0.5/(alpha T) and 1.3/(alpha T).
+# 65: 4/T with unknown mean, half of it from the mean), the spectral one by 0.1/T to 1.2/T, or by
+# 1.6/T to 2.5/T with 5 mV of noise (600 simulated windows each of 12 to 126 relaxation times).
+# Var_inf = sigma^2 / (2 alpha) is convex in alpha, so one correction for both parameters is a
+# compromise: Var_inf remains too high, by 0.5/(alpha T) and 1.3/(alpha T).
 _HIGH_BY = (0.5, 1.5)
-# Share of the mean square below which a residual, or the diffusion of one step, is rounding error.
+# Share of the mean square below which a residual, or the diffusion of a step, is rounding error.
 _EXACT = 1e-14
 
 
@@ -414,9 +420,9 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
                stamps: Callable[[float], bool], before: Maximum | None,
                ) -> tuple[WindowFit, Maximum | None]:
     """Fit the OU, the noise and the mean (t in s, y in V, load of shape (c, n), adc step in V)."""
-    # load: empty while throttle is constant; m: raw samples averaged in each sample; stamps:
-    # whether the exact likelihood is needed, given alpha times the mean step (inf: for any alpha);
-    # before: the second value returned for a nearly identical window.
+    # load: empty while throttle is constant.  m: number of raw samples averaged in each sample.
+    # stamps: returns whether the exact likelihood is needed, given alpha times the mean step (inf:
+    # for any alpha).  before: the second value returned for a nearly identical window.
     level = np.append(y.mean(), load.mean(axis=1))
     centred = load - level[1:, None]
     basis = independent(centred @ centred.T / t.size)
@@ -427,7 +433,7 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
     time = time - time.mean() - within @ known
     used, apart = 1 + len(known), float(time @ time) > _APART * t.size / 12.0
     rows = np.stack([np.ones(t.size), *known, *([time] if apart else []), y - level[0]])
-    # Fit least-squares residuals, to avoid rounding errors; add the least-squares fit afterwards.
+    # To avoid rounding errors, fit the residuals of a least-squares fit, which is added later.
     plain = np.linalg.lstsq(rows[:used].T, rows[-1], rcond=None)[0]
     rows[-1] -= plain @ rows[:used]
     left = rows[-1]
@@ -455,8 +461,8 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
         again = None if doubtful or found.edge or held > m else found
         if apart and found.edge <= 0 and (
                 doubtful or abs(_score(found.gram, used, likelihood.n)) > SUSPECT):
-            # Without a restoring force any drift may be chance; so the restoring force in the fit
-            # with a drift decides.
+            # Without a restoring force, any drift may be chance; so require a restoring force in
+            # the fit with the drift.
             drifting = maximise(likelihood, used + 1, again)
             if drifting.edge <= 0 and drifting.beta[-1] ** 2 > drifting.beta_cov[-1, -1] * (
                     TREND_SCORE * (1.0 + _FEW / (drifting.a * likelihood.n))) ** 2:
@@ -486,7 +492,7 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
 
 
 def _spectral(t: FloatArray, rows: FloatArray, m: int, factor: int = 1) -> SpectralLikelihood:
-    """Return the likelihood of the stretches without a gap, or of means of `factor` samples."""
+    """Return the likelihood of stretches without gaps, from means of `factor` samples."""
     parts = stretches(t) or [slice(0, t.size)]
     sizes = [(part.stop - part.start) // factor for part in parts]
     step = sum(t[part.stop - 1] - t[part.start] for part in parts) / sum(

@@ -1,8 +1,8 @@
 """
 Quality of the input and the fit: ADC steps, bias, corrected errors, status, flags.
 
-In a diffusion, equal adjacent values have probability zero; so repeats, grids and accumulations at
-the extremes are detected without a model.
+In a diffusion, equal adjacent values have probability zero.  So repeats, ADC grids and clipped
+values are detected without a model.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # Minimum number of samples for any finding.
 _ENOUGH = 64
-# Minimum number of different steps, all whole multiples of one, that reveal the grid of an ADC;
+# Minimum number of different steps, all whole multiples of one, that prove the grid of an ADC;
 # fewer may be chance.
 _FEWEST_STEPS = 3
-# Share of adjacent samples that differ, below which the ADC is coarse.
+# Share of adjacent samples that differ below which the ADC counts as coarse.
 _TIED = 0.9
-# Minimum share of samples at an extreme for the ADC range to count as exceeded, and minimum ratio
-# of their number to the number of samples at the adjacent code.
+# Minimum share of samples at an extreme value that counts as clipping, and minimum ratio of their
+# number to the number of samples at the adjacent code.
 _CLIPPED_SHARE = 0.01
 _CLIPPED_EXCESS = 3.0
 
@@ -35,8 +35,8 @@ class Quality:
 
     step: float = 0.0  # ADC step, V; 0 if the values lie on no grid
     held: float = 1.0  # Samples per reading of a source that repeats readings; 1: no repeats
-    saturated: bool = False  # Whether samples pile up at an extreme
-    rms_increment: float = math.nan  # Root mean square of the steps between fresh samples, V
+    saturated: bool = False  # Whether many samples are at an extreme value
+    rms_increment: float = math.nan  # Root mean square of the steps between samples, V
 
 
 def examine(y: FloatArray, held: float = 1.0) -> Quality:
@@ -47,16 +47,16 @@ def examine(y: FloatArray, held: float = 1.0) -> Quality:
     changes = np.flatnonzero(steps)
     if changes.size < _FEWEST_STEPS:
         return Quality(held=held)
-    # If many adjacent samples are equal, a single step size suffices to reveal a grid.
+    # If many adjacent samples are equal, a single step size suffices to prove a grid.
     tied = changes.size < _TIED * steps.size
     rms = float(np.sqrt(np.mean(steps * steps)))
-    # No step if its square underflows to zero.
+    # If the squares underflow to zero, there is no step.
     step = lattice(np.abs(steps[changes]), 1 if tied else _FEWEST_STEPS) if rms > 0.0 else 0.0
     return Quality(step, held, _piles_up(y), rms)
 
 
 def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
-    """Return the common step of increments, V; 0 if there is none above 1e-3 of the largest."""
+    """Return the common divisor of increments, V; 0 if none is above 1e-3 of the largest."""
     ordered = np.unique(sizes)
     least = float(ordered[0])
     # Rounding splits one step into several: average the steps within 1e-3 of the smallest.
@@ -81,22 +81,22 @@ def _piles_up(y: FloatArray) -> bool:
     return False
 
 
-# Relaxation times in the window from which alpha is known to a quarter (doc/estimation.md).
+# Number of relaxation times in the window from which alpha is known to 25 % (doc/estimation.md).
 GOOD_RELAXATIONS = 25.0
 # Alpha counts as buried in noise if the standard error of ln(alpha), before it is widened, exceeds
-# the first value, and the second times the error without noise (otherwise the cause is a short
-# window).
+# the first value, and also the second value times the error without noise (otherwise the short
+# window is the cause).
 _BURIED, _BURIED_BY = 0.5, 2.0
-# In short windows ln(alpha) has wider tails than its Fisher information implies.  So its standard
-# error is multiplied by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the coverage of 95 %
-# intervals to 94 % at x = 12; doc/estimation.md.
+# In short windows, ln(alpha) has wider tails than its Fisher information implies.  So its standard
+# error is multiplied by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, with which the coverage of 95 %
+# intervals is 94 % at x = 12.
 _WIDER, _MUCH_WIDER, _AS_FITTED = 1.5, 70.0, 1.5
-# Distance of the noise from zero, in standard errors, within which errors of sigma are reduced.
+# Distance of the noise from zero, in standard errors, within which the error of sigma is reduced.
 _NEAR = 0.75
 # Minimum standard deviation of throttle to estimate the sag.
 MIN_THROTTLE_STD = 0.005
-# Correlation of neighbouring increments in excess of an OU's, absolute and in standard errors,
-# above which a low-pass upstream is suspected.
+# Excess of the correlation of neighbouring increments over an OU's, absolute and in standard
+# errors, above which a low-pass upstream is suspected.
 _SMOOTH, _SMOOTH_SCORE = 0.05, 5.0
 
 
@@ -105,23 +105,23 @@ def log_errors(fit: WindowFit, duration: float) -> tuple[float, float, float]:
     # At least a thousandth, to avoid a division by zero.
     relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
     wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
-    # If no noise was found, theta is at or near its bound, and the information overstates the
-    # error of sigma.  Within `_NEAR` standard errors of the bound, the error is therefore reduced
-    # as for a normal distribution truncated on one side (0.68 of the variance, because theta
-    # causes most of the variance of sigma).
+    # If no noise was found, the MA coefficient theta is at or near its bound, and the error of
+    # sigma from the information is too large.  Within about `_NEAR` standard errors of the bound,
+    # this error is therefore reduced as for a normal distribution truncated on one side (to 0.68
+    # of the variance, because theta causes most of the variance of sigma).
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
     return (_se(fit.log_var[0]) * wider, _se(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
             _se(fit.log_var[2]) * wider)
 
 
 def _se(variance: float) -> float:
-    """Return a standard error; infinite where the information is singular."""
+    """Return a standard error; infinite if the information is singular."""
     return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
 def judge(fit: WindowFit, measured: Mapping[str, Any], quality: Quality, throttle_std: float,
           smoothness: float) -> Estimate:
-    """Return the published estimate; `measured`: fields that do not depend on the fit."""
+    """Return the published estimate; `measured`: its fields that do not depend on the fit."""
     flags = input_flags(measured['counters'], quality, throttle_std)
     if fit.trend:
         flags.append(Flag.TREND)
@@ -144,7 +144,7 @@ def judge(fit: WindowFit, measured: Mapping[str, Any], quality: Quality, throttl
         return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
-    # In a short window alpha is often overestimated: reduce `relaxations` by one standard error.
+    # In a short window alpha may be overestimated, so reduce `relaxations` by one standard error.
     surely = relaxations * math.exp(-se[0])
     alpha = fit.alpha - fit.high / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)
@@ -186,5 +186,5 @@ def _level(fit: WindowFit, throttle: float, moves: bool) -> tuple[float, float]:
 
 
 def load_at(throttle: float) -> FloatArray:
-    """Return the load variables for a throttle that has been constant for long."""
+    """Return the load variables for a throttle at which all lags have settled."""
     return np.array([throttle, throttle * throttle, throttle, throttle])

@@ -1,9 +1,9 @@
 """
 From the wanted cutoff of a law to the cutoff in force.
 
-limits -> dead band -> smoothing of ln(fc), faster if sigma is certain -> slew limit -> 0.45 of
-the sample rate, but not below fmin.  An unknown cutoff is replaced by the fallback.  The cutoff in
-force is always within fmin..fmax, whatever the rate.
+limits -> dead band -> smoothing of ln(fc), faster if sigma is certain -> slew limit -> limit of
+0.45 of the sample rate.  The fallback replaces an unknown wanted cutoff.  The cutoff in force is
+always within fmin..fmax, even if 0.45 of the sample rate is below fmin.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ ARRIVED = 1e-6
 LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
-# Number of samples over which the sample rate is averaged; factor from the mean above which an
-# interval is an outlier; number of outliers in a row that mean a new rate.
+# Number of samples over which the sample rate is averaged; ratio to the mean, up or down, beyond
+# which an interval is an outlier; number of outliers in a row that show a new rate.
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
-# Relative error of sigma for which the time constant `smoothing` is stated, and maximum factor by
-# which other errors change the time constant (our choice, within Betaflight's 1 to 10).
+# Relative error of sigma to which the parameter `smoothing` refers, and maximum factor by which
+# other errors change the time constant (our choice, within Betaflight's 1 to 10).
 _ERROR, _RANGE = 0.1, 4.0
 
 
 class Bound(enum.Enum):
-    """What determines the cutoff at this sample; the value is its text."""
+    """What determines the present cutoff; the value is its text."""
 
     NONE = 'the law'
     LOWEST = 'fmin'
@@ -45,8 +45,9 @@ class Bound(enum.Enum):
 class SampleInterval:
     """Mean time between samples, s, over about 100 of them; 0 before the second sample."""
 
-    # Intervals over five times the mean count as gaps, and are left out unless a third of all are
-    # gaps.  Five successive intervals that differ by a factor of five are a new rate.
+    # Intervals above five times the mean count as gaps, and are left out.  If more than about a
+    # third of all intervals are gaps, or if five successive intervals are below a fifth of the
+    # mean, the mean starts again.
 
     __slots__ = ('_long', '_n', '_short', 'mean')
 
@@ -66,7 +67,7 @@ class SampleInterval:
             if self._short >= _NEW:
                 return self._restart(dt)
         else:
-            # Two normal intervals make up for a gap.
+            # Two normal intervals outweigh a gap.
             self._short, self._long = 0, max(self._long - 1, 0)
         if self._n < INTERVALS:
             self._n += 1
@@ -81,9 +82,9 @@ class SampleInterval:
 
 def time_constant(settings: FilterSettings, error: float) -> float:
     """Return the time constant of the cutoff, s, for a relative error of sigma."""
-    # A random walk of intensity q, measured with an error e over a correlation time T, is tracked
-    # best (steady Kalman filter) with the time constant e sqrt(T) / q, which is proportional to e.
-    # Betaflight moves its notches 1 to 10 times as fast.
+    # A random walk of intensity q, measured with an error e of correlation time T, is tracked best
+    # (steady Kalman filter) with the time constant e sqrt(T) / q, which is proportional to e.
+    # Betaflight varies the speed of its notches by factors from 1 to 10.
     if error != error:
         return settings.smoothing
     return settings.smoothing * min(max(error / _ERROR, 1.0 / _RANGE), _RANGE)
@@ -95,7 +96,7 @@ class CutoffControl:
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
         self._lowest = settings.lowest
-        # Target; cutoff that approaches it; cutoff in force, Hz.
+        # Target; cutoff that approaches the target; cutoff in force, Hz.
         self._aim = self._moving = self.cutoff = settings.fallback
         self._wanted = math.nan
         self._started = self._follow_exactly = self._slewing = False
@@ -124,7 +125,7 @@ class CutoffControl:
         return Bound.NONE if self._wanted == self._aim else Bound.DEAD_BAND
 
     def configure(self, settings: FilterSettings) -> None:
-        """Change settings; keep the cutoff, within the new limits."""
+        """Change settings; keep the cutoff as far as the new limits allow."""
         self._settings = settings
         self._lowest = settings.lowest
         self._moving = self._clip(self._moving)
@@ -135,7 +136,7 @@ class CutoffControl:
             self._aim = self._moving = self.cutoff = settings.fallback
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
-        """Take the law's cutoff, return the cutoff in force, Hz (times in s; 0: unknown)."""
+        """Take the law's cutoff; return the cutoff in force, Hz (times in s; 0: unknown)."""
         self._choose(wanted)
         if not self._started:
             self._started, self._moving = True, self._aim

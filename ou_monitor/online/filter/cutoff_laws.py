@@ -11,21 +11,21 @@ integral of |H(iw)|^2 / (alpha^2 + w^2) over the frequencies:
     derivative, order 1   V = w^2 / (2 (w + alpha))
     derivative, order 2   V = w^3 / (2 sqrt2 (w^2 + sqrt2 w alpha + alpha^2))
 
-All grow with w, so each variance has one cutoff.
+All of these grow with w, so each variance belongs to one cutoff.
 
-White noise: with the input linear between samples, a step of the filter is z' = F z + a x_(k-1)
-+ b x_k (F, a and b come from `LowPassState`).  So independent samples of variance 1
-give the stationary covariance
+White noise: if the input is linear between samples, a step of the filter is
+z' = F z + a x_(k-1) + b x_k (F, a and b come from `LowPassState`).  So for independent
+samples of variance 1, the stationary covariance is
 
-    C = F C F^T + a a^T + b b^T + F b a^T + a b^T F^T,
+    C = F C F^T + a a^T + b b^T + F b a^T + a b^T F^T.
 
-and their slopes (x_k - x_(k-1)) / dt, adjacent ones of which have a correlation of -1/2,
-give, with g = a + b,
+For their slopes (x_k - x_(k-1)) / dt, of which adjacent ones have a correlation of
+-1/2, C solves, with g = a + b,
 
     C dt^2 = F C F^T dt^2 + 2 g g^T - F g g^T - g g^T F^T.
 
-Limits: the laws are stationary, for a constant cutoff, and ignore noise above half
-the sample rate, which is aliased.
+Limits: the laws are for the stationary output at a constant cutoff, and ignore noise
+above half the sample rate, which is aliased.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 
-# Range of angles (2 pi cutoff interval) in the table, and step of their logarithms: interpolation,
-# and the power law below the first, are accurate to 1e-4.
+# Range of angles (2 pi cutoff interval) in the table, and step of their logarithms, with which
+# interpolation, and the power law below the range, are accurate to 1e-4.
 _LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
-# Minimum rise of ln noise from angle to angle: the table ends where all noise passes.
+# Minimum rise of ln noise from angle to angle; with less, all noise passes, and the table ends.
 _STILL = 1e-6
 
 
@@ -78,7 +78,7 @@ def _step(order: int, angle: float, y: float, slope: float, start: float, end: f
 
 @cache
 def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
-    """Return ln of angles and of their noise, both rising, and the exponent of noise below."""
+    """Return ln of angles, ln of their noise, and the exponent of the noise below the range."""
     count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
     angle = math.log(_LEAST_ANGLE) + _STEP * np.arange(count)
     noise = np.log([white_noise(mode, order, one) for one in np.exp(angle).tolist()])
@@ -90,7 +90,7 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """Return `relative_cutoff` for the sampled filter, Hz (interval in s)."""
+    """Return `relative_cutoff` of the filter at this sampling interval, s; Hz."""
     angle, noise, power = _table(mode, order)
     log = math.log(TWO_PI * fmax * interval)
     before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (
@@ -107,7 +107,7 @@ _ROOT8 = 2.0 * _ROOT2
 
 
 def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
-    """Return the cutoff of the law, Hz (V/sqrt(s), 1/s, interval in s)."""
+    """Return the law's cutoff, Hz, NaN if sigma is unknown (V/sqrt(s), 1/s, interval in s)."""
     if not (math.isfinite(sigma) and sigma >= 0.0):
         return NAN
     rate = alpha if 1e-6 <= alpha <= 1e9 else settings.alpha
@@ -124,8 +124,8 @@ def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
 def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
                        interval: float) -> float:
     """Return the cutoff at which the rms of the output noise has the wanted value."""
-    # Without `coupling`, the noise is taken as white, with a variance proportional to sigma^2.  By
-    # default the output keeps the rms that it has at `sigma_ref` and fmax.
+    # Without `coupling`, the noise is taken as white, with a variance proportional to sigma^2.
+    # The default of the wanted rms is the rms at `sigma_ref` and fmax.
     if settings.coupling:
         wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
             supply_noise(settings.mode, settings.order, settings.fmax, alpha))
@@ -139,7 +139,7 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
     """Return the cutoff, Hz, at which white noise `times` as large has the same rms as at fmax."""
-    # interval in s, 0: continuous.  The condition is the range of `_table`.
+    # interval in s; 0: a continuous signal.  The condition keeps within the range of `_table`.
     if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
         return held_cutoff(mode, order, fmax, times, interval)
     # Far below the sample rate, white noise of two-sided density N has the variance N w / 2 (order
@@ -147,8 +147,8 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     if mode == 'lowpass':
         return fmax / (times * times)
     # Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and
-    # fc = fmax / times^(2/3).  Order 1: the integral is finite only because of the sample rate;
-    # independent samples of variance v give v w^2, so fc = fmax / times.
+    # fc = fmax / times^(2/3).  Order 1: only sampling makes the integral finite; for independent
+    # samples of variance v it is v w^2, so fc = fmax / times.
     return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times
 
 
@@ -170,7 +170,7 @@ _LOGS = -14.0, 21.0
 
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
                      alpha: float) -> float:
-    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf: never so large."""
+    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf: always less."""
     if intensity <= 1e-12 * rms:
         return math.inf
     wanted = (rms / intensity) ** 2

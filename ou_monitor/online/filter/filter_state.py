@@ -1,21 +1,22 @@
 """
-The low-pass itself: two states, advanced by steps of any length; its phase lag.
+The low-pass itself: two states, advanced by steps of any length; and its phase lag.
 
 With w = 2 pi fc, input x, output y:
 
     order 1:  y' = w (x - y)
     order 2:  y' = w s,  s' = w (x - y - sqrt(2) s)     (Butterworth)
 
-A change of the cutoff only stretches time (dtau = w dt), so for *any* sequence of
-cutoffs, y is the response of one fixed filter to the input in stretched time.  So y
-is continuous, and at most the largest input times the integral of the absolute
-impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
+A change of the cutoff only stretches time (dtau = w dt).  So for *any* sequence of
+cutoffs, y is the response of one fixed filter to the input in stretched time.  It is
+continuous, and at most the largest input times the integral of the absolute impulse
+response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
 
-Between samples the input is linear.  An input held at its newest value would lead by
-half a sample (18 degrees at a tenth of the sample rate); a linear one has no phase
-error, and its amplitude is too small by (pi f dt)^2 / 3.  So with r = f / fc the lag is that of
-the continuous filter: atan r for order 1, atan2(sqrt(2) r, 1 - r^2) for order 2.  The lag of a
-derivative is relative to the true derivative.
+The input is taken as linear between samples.  If it were held at the newest sample, the
+output would lead by half a sample (18 degrees at a tenth of the sample rate).  Linear
+interpolation has no phase error, and makes the amplitude too small by (pi f dt)^2 / 3.  So the
+lag equals the continuous filter's: with r = f / fc, it is atan r for order 1, and
+atan2(sqrt(2) r, 1 - r^2) for order 2.  The lag of a derivative is relative to the true
+derivative.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class LowPassState:
         self.slope = 0.0
 
     def advance(self, order: int, angle: float, start: float, end: float) -> float:
-        """Solve the filter over one step."""
+        """Advance over one step, with input from `start` to `end`; angle: w dt; return y."""
         rise = end - start
         off = self.y - start
         if order == 1:
@@ -44,8 +45,9 @@ class LowPassState:
             self.slope = 0.0
             self.y += lost * off + rise * (1.0 + lost / angle)
             return self.y
-        # Poles at w exp(+-3i pi/4): closed form of the 2 x 2 exponential, and of its integral
-        # over the ramp, in terms that are small for a short step, to avoid cancellation.
+        # Poles at w exp(+-3i pi/4): closed form of the 2 x 2 matrix exponential, and of its
+        # integral over the ramp, with terms that are small for a short step, to avoid
+        # cancellation.
         p = angle / _ROOT2
         decay, sin = math.exp(-p), math.sin(p)
         c = math.expm1(-p) * math.cos(p) - 2.0 * math.sin(0.5 * p) ** 2
@@ -90,9 +92,9 @@ def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
 
 
 def share_for_lag(response: complex, raw: complex, most: float) -> float:
-    """Return the share of the raw signal in a mixture whose lag is at most `most`, rad."""
-    # A mixture (1 - m) H + m R has the lag p where (1 - m) H e^(ip) + m R e^(ip) has the imaginary
-    # part 0.
+    """Return the share of the raw signal with which a mixture lags by at most `most`, rad."""
+    # A mixture (1 - m) H + m R has the lag p if the imaginary part of ((1 - m) H + m R) e^(ip) is
+    # zero.
     if -cmath.phase(response) <= most:
         return 0.0
     turned, straight = (one * cmath.exp(1j * most) for one in (response, raw))

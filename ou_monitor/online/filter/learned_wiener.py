@@ -2,25 +2,26 @@
 The law `kalman`: a Wiener filter of a signal in supply noise, learned in flight.
 
 The vector z contains the outputs of four low-passes, and the input.  It is the sum of an unknown
-signal and noise, z = z_s + z_n.  The noise is known: `coupling` times the supply's noise (an OU
-with sigma and alpha), plus white noise n0.  With the covariances C_s of the signal and C_n of the
-noise, and c_s, the last column of C_s, the weights
+signal and noise, z = z_s + z_n.  The statistics of the noise are known: it is `coupling` times the
+supply's noise (an OU with sigma and alpha), plus white noise n0.  With the covariances C_s of the
+signal and C_n of the noise, and c_s, the last column of C_s, the weights
 
     w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
 
 give the linear combination w^T z with the least mean square error, as an estimate of the last
-element of z_s (the signal, or its slope): the multichannel Wiener filter (Doclo & Moonen 2002,
-IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T with the time constant `_MEMORY`.
-Each hop of 10 ms has the weight 1 / noise^2 (noise: power), because the variance of z z^T grows
-with noise^2.  C_s keeps only what exceeds the sampling error of C_z - C_n, in each direction.
+element of z_s (the signal, or its slope).  This is the multichannel Wiener filter (Doclo & Moonen
+2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T with the time constant
+`_MEMORY`.  Each hop of 10 ms has the weight 1 / p^2, with p the power of the noise, because the
+variance of z z^T grows with p^2.  In each direction, C_s keeps only the part of C_z - C_n that
+exceeds the sampling error.
 
 - Wrong noise: if the stated noise is so large that the power of the signal would be negative, the
   noise is reduced.  If it is too small, this can be detected only for a derivative, where some
-  direction contains almost no signal; the noise is increased to the power in that direction.
+  direction contains almost no signal; then the noise is increased to the power in that direction.
 - Manoeuvre after calm: if a hop does not fit C_s + C_n (largest normalised square above the 99.9 %
   quantile of chi squared), C_s is scaled up in proportion, which opens the filter at once.
-- If the lag of the combination exceeds its limit, just enough of the input is mixed in to meet it
-  (`share_for_lag`).
+- If the lag of the combination exceeds its limit, just enough of the input is added to meet the
+  limit (`share_for_lag`).
 
 A step of the low-passes (`filter_state`) is z' = F z + a start + b end, exact for an input that is
 linear between samples; for a derivative the input is the difference quotient.
@@ -28,9 +29,9 @@ linear between samples; for a derivative the input is the difference quotient.
 C_n for noise with autocorrelation phi^k: with the noise p' = phi p + e as a further state, the
 covariance solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
 
-Limits: in mode `lowpass`, noise above its stated value passes as signal.  The gain at frequency 0
-is below 1.  Below 2 Hz and above 128 Hz the filter is no better than its slowest and its fastest
-low-pass.  Intervals within 1 % of each other count as equal.
+Limits: in mode `lowpass`, noise in excess of the stated noise passes as signal.  The gain at
+frequency 0 is below 1.  Below 2 Hz and above 128 Hz, the filter is no better than its slowest and
+its fastest low-pass.  Intervals within 1 % of each other count as equal.
 """
 
 from __future__ import annotations
@@ -47,20 +48,20 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 Complexes = npt.NDArray[np.complex128]
-# Cutoffs, Hz, two octaves apart, in the range of vehicle motions (benchmarks/learned.py names
-# the recordings used to choose them).
+# Cutoffs, Hz, two octaves apart, which cover vehicle motions (benchmarks/learned.py names the
+# recordings on which they were chosen).
 CUTOFFS = (2.0, 8.0, 32.0, 128.0)
 COUNT = len(CUTOFFS) + 1
 _TWO_PI = 2.0 * math.pi
 _ORDER, _SAME = 2, 0.01
-# Maximum number of steps whose matrices are cached.
+# Maximum number of step lengths whose matrices are cached.
 _STEPS = 64
 # Convergence tolerance of the sum over powers of A.
 _GONE = 1e-18
 
 
 def _key(x: float) -> int:
-    """Return the number of a bin of width 1 % on the log scale."""
+    """Return the index of a value's bin, on a logarithmic scale with bins of 1 %."""
     return round(math.log(x) / _SAME)
 
 
@@ -83,7 +84,7 @@ def step_of(key: int) -> FloatArray:
 
 
 def response_of(interval: float, frequency: float, slope: bool) -> Complexes:
-    """Return the frequency response of each output, shape (5,) (interval in s, Hz)."""
+    """Return the frequency response of each output, shape (5,) (arguments in s and Hz)."""
     step = step_of(_key(interval))
     back = np.exp(-1j * _TWO_PI * frequency * interval)
     raw = (1.0 - back) / interval if slope else 1.0 + 0.0j
@@ -96,7 +97,7 @@ def response_of(interval: float, frequency: float, slope: bool) -> Complexes:
 @lru_cache(maxsize=_STEPS)
 def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     """Return the covariance of z, shape (5, 5), for noise of variance 1 and rate decay, 1/s."""
-    # key: of the interval, s; decay: infinite for white noise.
+    # key: `_key` of the interval, s; decay: infinite for white noise.
     interval, step = math.exp(_SAME * key), step_of(key)
     size = step.shape[0]
     phi = math.exp(-decay * interval)
@@ -119,8 +120,8 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     return np.asarray(p[np.ix_(outputs, outputs)])
 
 
-# Time between updates of the weights, which is also the time constant of the transition, and
-# memory, s; chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
+# Time between updates of the weights, which is also the time constant of the transition between
+# weights, and memory, s; chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
 # Weight of the prior (no signal), s.
 _BEFORE = 1.0
@@ -128,23 +129,23 @@ _BEFORE = 1.0
 _MISFIT = 20.515
 # Maximum number of samples per hop, for fast inputs.
 _ROWS = 256
-# Regularisation: noise added to each output, as a share of its noise and of its power.
+# Regularisation: noise added to each output, as shares of its noise and of its power, and minimum.
 _FLOOR, _FLOOR_OF_ALL, _TINY = 1e-9, 1e-12, 1e-200
-# Minimum factor on the stated noise; maximum input that is used for learning.
+# Minimum factor on the stated noise; maximum input that is learned from.
 _LEAST, _LARGEST = 1e-3, 1e60
-# Maximum weight of a step, in intervals.
+# Maximum time for which a sample counts, in intervals.
 _GAP = 5.0
 _RAW = np.eye(COUNT)[-1]
 
 
 class LearnedWiener:
-    """The best linear combination of a few low-passes, starting at a first sample x."""
+    """The best linear combination of low-passes and input, starting at a first sample x."""
 
     def __init__(self, settings: FilterSettings, x: float) -> None:
         self._settings = settings
         self._slope = settings.mode == 'derivative'
-        # Estimate of the signal, or of its slope (unit/s); its lag at `lag_frequency`, degrees,
-        # NaN if unknown; share of unfiltered input in it.
+        # Estimate of the signal, or of its slope (unit/s); lag of the estimate at `lag_frequency`,
+        # degrees, NaN if unknown; share of unfiltered input in the estimate.
         self.y = 0.0 if self._slope else x
         self.lag, self.mixed = NAN, 0.0
         self._x = x
@@ -156,7 +157,7 @@ class LearnedWiener:
         self._weights = np.zeros(COUNT) if self._slope else _RAW.copy()
         self._offset = 0.0
         self._log_sigma = NAN
-        # Means of z z^T and of the noise in it, sum of the weights and of their squares.
+        # Means of z z^T and of its part due to noise; sums of the weights and of their squares.
         self._power = self._noise = np.zeros((COUNT, COUNT))
         self._sum = self._squares = self._level = 0.0
         self._whiten: FloatArray | None = None
@@ -205,7 +206,7 @@ class LearnedWiener:
         try:
             found = self._best(noise, misfit)
         except np.linalg.LinAlgError:
-            # Discard the means: noise many powers of ten larger has made them too inaccurate.
+            # Discard the means, which are inaccurate after noise many powers of ten larger.
             self._sum, self._whiten = 0.0, None
             return
         if np.all(np.isfinite(found)):
@@ -213,7 +214,7 @@ class LearnedWiener:
 
     def _best(self, noise: FloatArray, misfit: float) -> FloatArray:
         """Return the optimal weights for the present noise."""
-        # Regularisation of the power and of the noise.
+        # Regularise power and noise.
         floor = np.diag(_FLOOR * np.diag(self._noise + noise)
                         + _FLOOR_OF_ALL * np.diag(self._power) + _TINY)
         root = np.linalg.cholesky(self._noise + floor)
@@ -249,7 +250,7 @@ class LearnedWiener:
         return found
 
     def _misfit(self, rows: FloatArray) -> float:
-        """Return the factor by which the power of the hop exceeds the model; 1: it fits."""
+        """Return the factor by which the power of the hop exceeds the model's; 1 if it fits."""
         if self._whiten is None:
             return 1.0
         squares = np.sum((rows @ self._whiten)**2, axis=1)
@@ -258,7 +259,7 @@ class LearnedWiener:
         return min(max(float(np.mean(squares)) / COUNT, 1.0), _LARGEST)
 
     def _remember(self, rows: FloatArray, noise: FloatArray, interval: float) -> None:
-        """Take a hop and its noise into the means."""
+        """Include a hop and its noise in the means."""
         level = max(float(noise[-1, -1]), _TINY)
         span = min(self._for, _GAP * interval * self._n)
         if not self._sum:
@@ -276,7 +277,7 @@ class LearnedWiener:
         s = self._settings
         response = response_of(interval, s.lag_frequency, self._slope)
         if self._slope:
-            # Both lags relative to the true derivative.
+            # Take both lags relative to the true derivative.
             response = response / (1j * _TWO_PI * s.lag_frequency)
         h, raw = complex(weights @ response), complex(response[-1])
         if not abs(h) > 1e-9 * abs(raw):

@@ -7,11 +7,11 @@ sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
 The derivative is the same low-pass, applied to the slope of the input.  It does not jump when the
 cutoff changes, and is exact for an input that is linear between samples.
 
-With the law `kalman` the output comes from `learned_wiener`.  The low-pass runs in parallel at the
-cutoff of equal lag, and takes over while sigma is unknown.
+With the law `kalman`, the output comes from `learned_wiener`.  The low-pass runs in parallel, at
+the cutoff of equal lag, and replaces it while sigma is unknown.
 
-Limits: the cutoff is constant within a step; frequencies above half the sample rate are aliased
-before any filter.
+Limits: the cutoff is constant within a step; frequencies above half the sample rate are aliased by
+the sampling, before the filter.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from ou_monitor.records import FloatArray, NAN
 _TWO_PI = 2.0 * math.pi
 # Limits within which nothing overflows: maximum signal and stamp, s; minimum step, s.
 LARGEST, LATEST, SHORTEST = 1e150, 1e18, 1e-12
-# Minimum gap, in mean intervals; number of samples before gaps are counted.
+# Minimum length of a gap, in mean intervals; number of samples before gaps are counted.
 _GAP, _KNOWN = 5.0, 10
-# Number of samples that are converted to Python floats at a time; limits memory.
+# Number of samples converted to Python floats at a time; limits memory.
 _PIECE = 16384
 # Relative change of the mean interval at which the law is evaluated again: five standard
 # deviations of the mean of 100 intervals that jitter uniformly by up to a third.
@@ -47,7 +47,7 @@ _Maybe = npt.ArrayLike | None
 
 @dataclass
 class FilterCounters:
-    """Numbers of samples by outcome."""
+    """Counts of samples by outcome."""
 
     samples: int = 0  # Samples used
     # Samples that were not finite or beyond 1e150, or whose stamp was not finite or beyond 1e18 s.
@@ -88,11 +88,11 @@ class AdaptiveLowPass:
         self._settings = FilterSettings.from_options(options)
         self._control = CutoffControl(self._settings)
         self._state = LowPassState()
-        # For the law kalman; None until sigma is known for the first time.
+        # For the law `kalman`; None until sigma is known for the first time.
         self._kalman: LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
-        # Copy from before a change of parameters, until the next sample.
+        # Copy with the parameters before a change, kept until the next sample.
         self._before: LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
@@ -171,8 +171,8 @@ class AdaptiveLowPass:
         Raises
         ------
         ValueError
-            For an option that cannot be used (no option changes then), or
-            another mode, whose output has another unit: make a new filter.
+            For an option that cannot be used (no option changes then), or for
+            another mode: its output has another unit, so make a new filter.
 
         """
         settings = FilterSettings.from_options(options, base=self._settings)
@@ -208,8 +208,8 @@ class AdaptiveLowPass:
         sigma : float or array_like, shape (n,)
             Noise intensity, V/sqrt(s); NaN means unknown (fallback cutoff).
         sigma_se : float or array_like, shape (n,), optional
-            Standard error of ln sigma, as in `Estimate` (0.1: 10 %): the smaller
-            it is, the faster the cutoff follows.
+            Standard error of ln sigma, as in `Estimate` (0.1: 10 %); the cutoff
+            follows faster if the error is smaller.
         alpha : float or array_like, shape (n,), optional
             Relaxation rate of the supply, 1/s; NaN or omitted: the parameter.
 
@@ -266,7 +266,7 @@ class AdaptiveLowPass:
         dt = t - self._t
         if dt < SHORTEST:
             if dt < 0.0:
-                # The next slope begins at the earlier stamp.
+                # Continue from the earlier stamp.
                 self._t, self._x = t, x
                 self.counters.back += 1
             else:
@@ -293,7 +293,7 @@ class AdaptiveLowPass:
         return self._out
 
     def _source(self) -> float:
-        """Return the output without the transition after a switch of `shadow`."""
+        """Return the output without the transition that follows a change of its source."""
         if self._settings.shadow:
             return self._raw
         return self._kalman.y if self._kalman is not None and self._known else self._state.y

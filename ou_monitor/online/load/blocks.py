@@ -1,13 +1,13 @@
 """
 Group samples into blocks; learn the delay of throttle, changes of the response, and noise.
 
-A block has one throttle; there are at most about 50 blocks a second.  Limits: an incomplete block
-is not returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms
-only the first three are resolved.
+All samples of a block have the same throttle; there are at most about 50 blocks a second.  Limits:
+an incomplete block is not returned, so a fast source is followed 20 ms late; of several throttle
+changes within 20 ms, only the first three are resolved.
 
 Delay: the voltage, without changes slower than a second, is correlated with throttle at assumed
-delays of 0 to 200 ms; the largest correlation determines the delay, unless the source is slower
-than 7 Hz.  A new delay is used only if it leaves a quarter less variance than the present one.
+delays of 0 to 200 ms.  The largest correlation determines the delay, unless the source is slower
+than 7 Hz.  A new delay is adopted only if it leaves a quarter less variance than the present one.
 
 Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; in a mean of n
 samples, the part of the variance within a block is divided by n.
@@ -29,9 +29,9 @@ from ou_monitor.records import FloatArray, NAN
 WIDTH = 0.02
 # Samples farther apart than this, s, are separate blocks.
 _APART = 0.75 * WIDTH
-# Difference below which throttles are equal: the sag differs by less than an ADC step.
+# Difference below which throttles count as equal; their sags differ by less than an ADC step.
 _EQUAL = 0.01
-# Number of throttle changes within a bin that end a block.
+# Maximum number of throttle changes within a bin that end a block.
 _CHANGES = 3
 
 
@@ -43,14 +43,14 @@ class LoadBlock:
     t: float
     last: float
     voltage: float  # Mean voltage, V
-    throttle: float  # Mean throttle, 0..1; NaN where unknown
+    throttle: float  # Mean throttle, 0..1; NaN if unknown
     current: float  # Mean of the known currents, A; NaN if none is known
     n: int  # Number of samples
     within: float  # Variance of a sample about the mean, V^2; NaN for a single sample
 
 
 class LoadBlocks:
-    """Collects samples into blocks; a sample 15 ms or more after the last is its own block."""
+    """Collects samples into blocks; a sample at least 15 ms after the last is its own block."""
 
     def __init__(self) -> None:
         self.forget()
@@ -58,12 +58,12 @@ class LoadBlocks:
     def forget(self) -> None:
         """Start again with the next sample; drop the incomplete block."""
         self._sums: FloatArray | None = None
-        # Last sample: stamp, throttle, step before it, changes in its bin so far.
+        # Last sample: stamp, throttle, step before it, throttle changes in its bin so far.
         self._last = (-math.inf, NAN, math.inf, 0)
         self._zero = NAN
 
     def push(self, columns: FloatArray) -> list[LoadBlock]:
-        """Return the blocks that are complete with these samples (s, V, 0..1, A; shape (4, n))."""
+        """Return the blocks that these samples complete (rows in s, V, 0..1 and A; (4, n))."""
         t, voltage, throttle, current = columns
         if not t.size:
             return []
@@ -106,36 +106,36 @@ class LoadBlocks:
     def _block(self, sums: FloatArray) -> LoadBlock:
         n, t, off, square, throttle, current, known, last = sums.tolist()
         within = max(0.0, square - off * off / n) / (n - 1.0) if n > 1.0 else NAN
-        # Round the mean throttle: its rounding error depends on how samples are split into calls,
-        # and sqrt|du| of the noise would amplify it from 1e-17 to 1e-8.
+        # Round the mean throttle, because its rounding error depends on how samples are split into
+        # calls, and sqrt|du| of the noise would amplify this error from 1e-17 to 1e-8.
         return LoadBlock(t / n, last, self._zero + off / n, round(throttle / n, 12),
                          current / known if known else NAN, int(n), within)
 
 
 DELAYS = (0.0, 0.05, 0.1, 0.15, 0.2)  # s
-# Changes slower than this, s, are discharge and recovery, not a response to the stick.
+# Changes slower than this, s, are removed, because they are discharge and recovery.
 _SLOW = 1.0
-# A third of the response lags by 60 ms in the prior of the filter.
+# Share of the response that lags, and time constant of this lag, s, in the prior of the filter.
 _SHARE, _LAG = 1.0 / 3.0, 0.06
 # Minimum time compared, s, and memory, s.
 _FIRST, _MEMORY = 10.0, 60.0
 # Another delay is adopted if its residual variance is below this share of the present delay's.
 _BETTER = 0.75
-# Time, s, for which the residual variance must be below it.
+# Time for which this condition must hold, s.
 _LASTING = 3.0
-# Test of the relation to the voltage: length of segments, s, whose responses are nearly
+# Test of the relation between load and voltage: length of segments, s, whose responses are nearly
 # independent; memory, s; minimum number of segments.
 _PIECE, _PIECES_MEMORY, _FEWEST = 2.0, 120.0, 5.0
-# Minimum rms of a load for a test of its relation to the voltage.
+# Minimum rms of the load in a segment that is used for this test.
 _MOVED = 0.01
-# Standard errors of a significant relation: one false alarm in 700 tests.
+# Number of standard errors of a significant relation: one false alarm in 700 tests.
 _SIGNIFICANT = 3.0
-# Maximum step between blocks, s, with which these delays can be distinguished.
+# Maximum step between blocks, s, at which the delays can be distinguished.
 _LONGEST = 0.15
 
 
 class LoadDelay:
-    """Running correlations of voltage and load at several delays (lists, for speed)."""
+    """Running correlations of voltage and load at several delays; uses lists, for speed."""
 
     def __init__(self, delay: float = 0.0, *, either: bool = False) -> None:
         # Whether the load may have either sign.
@@ -151,13 +151,13 @@ class LoadDelay:
         self._xx = 0.0
         none = [0.0] * len(DELAYS)
         self._xv, self._vv = none, none
-        # Sums of the present piece: time, load squared, products, voltage squared.  Sums over the
-        # correlations of whole pieces: weight, values, squares.
+        # Sums of the present segment: time, load squared, products, voltage squared.  Sums over
+        # the correlations of complete segments: weights, values, squares.
         self._filled, self._own = 0.0, (0.0, none, none)
         self._pieces, self._sum, self._squares = 0.0, none, none
 
     def take(self, t: float, v: float, x: float) -> bool:
-        """Take a block, s, V, load as received; return whether the delay has changed."""
+        """Take time, s, voltage, V, and load of a block as received; return if delay changed."""
         dt = t - self._t
         if not 0.0 < dt <= _LONGEST:
             self.forget()
@@ -196,13 +196,13 @@ class LoadDelay:
                 self._sum = [keep * old + one for old, one in zip(self._sum, r)]
                 self._squares = [keep * old + one * one for old, one in zip(self._squares, r)]
             self._filled, self._own = 0.0, (0.0, [0.0] * len(volts), [0.0] * len(volts))
-        # Count only changes of the load beyond rounding.
+        # Count only times at which the load has changed by more than rounding.
         self._seen += dt * (x * x > 1e-6)
         return self._seen >= _FIRST and self._choose(dt)
 
     @property
     def unrelated(self) -> bool:
-        """Whether the mean correlation of 2 s segments is not significantly negative (t-test)."""
+        """Whether the mean correlation in 2 s segments is not significantly negative (t-test)."""
         if self._pieces < _FEWEST:
             return False
         now = DELAYS.index(self.delay)
@@ -225,15 +225,15 @@ class LoadDelay:
         return True
 
 
-# The response has changed if the voltage at rest and the load correlate by more than this in two
-# successive segments of `_PIECE`, of at least this number of blocks.  With 0.8, none of 22
-# recordings changed (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and others),
-# and simulated sags of 20 to 200 times the noise are noticed within 6 s.
+# Correlation of voltage at rest and load above which, on average over two successive segments of
+# `_PIECE`, the response has changed; minimum number of blocks in a segment.  With 0.8, no change
+# was detected in 22 recordings (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and
+# others), and simulated sags of 20 to 200 times the noise were detected within 6 s.
 _CHANGED, _BLOCKS = 0.8, 20
 
 
 class LoadChange:
-    """Notices that the response to load has changed, for example when the motors are armed."""
+    """Detects a change of the response to load, for example when the motors are armed."""
 
     def __init__(self) -> None:
         # Sums of 1, voltage at rest, load, and their products in the present segment; its start.
@@ -242,7 +242,7 @@ class LoadChange:
         self._last = 0.0  # Correlation in the last segment.
 
     def take(self, t: float, rest: float, x: float) -> bool:
-        """Take a block, s, its voltage at rest, V, and its load; return whether it has changed."""
+        """Take time, s, voltage at rest, V, and load; return whether the response has changed."""
         if not t - self._begun < _BLOCKS * _PIECE:
             self._begun, self._last, self._sums = t, 0.0, np.zeros(6)
         changed = False
@@ -256,17 +256,17 @@ class LoadChange:
         return changed
 
 
-# Limit of standard scores, above which errors weigh less, and limit of their squares in the noise.
+# Standard score above which errors weigh less, and limit of squared scores for learning the noise.
 CLIP, _OUTLIER = 4.0, 16.0
-# Variance of a prediction, V^2, above which the filter has diverged, as after readings of
-# megavolts, and restarts.
+# Variance of a prediction, V^2, above which the filter has diverged, for example after readings of
+# megavolts, and is restarted.
 DIVERGED = 1e12
 # Difference below which two voltages are the same reading of an ADC, V.
 _SAME = 1e-6
 # Change of throttle below which throttle counts as constant.
 _HELD = 1e-3
-# Memory of the noise, in updates: maximum, initial value, and growth per update.  It is short at
-# first, while the coefficients are still wrong.
+# Memory of the noise, in updates: maximum, initial value, and growth per update.  The memory is
+# short at first, while the coefficients are still wrong.
 _NOISE_MEMORY, _NOISE_FIRST, _NOISE_SHARE = 2000.0, 50.0, 1.0 / 3.0
 
 
@@ -275,11 +275,11 @@ def _dot(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 class LoadNoise:
-    """Noise of blocks of samples; volts: voltage of the pack."""
+    """Law of the noise of blocks; volts: voltage of the pack; b: initial coefficients."""
 
     def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
-        # Prior: 0.4 % of the voltage, with typical effects of ripple and changes of throttle; or
-        # the noise of another flight, within a factor of 1.4.
+        # Prior: 0.4 % of the voltage, and typical effects of ripple and throttle changes; or the
+        # coefficients of another flight, within a factor of 1.4.
         self.b = (math.log((0.004 * volts) ** 2), 2.0, 4.0) if b is None else b
         x, y, z = (4.0, 4.0, 9.0) if b is None else (0.5, 0.5, 1.0)
         self._covariance = [[x, 0.0, 0.0], [0.0, y, 0.0], [0.0, 0.0, z]]
@@ -289,7 +289,8 @@ class LoadNoise:
         # Step of the ADC, V, and share of blocks whose value differs from the previous one.
         self._step, self._changing, self._held = math.inf, 1.0, math.nan
         self._unseen = (0.05 * volts) ** 2
-        # Means over blocks: number of samples, variance within a block and of its mean, V^2.
+        # Averages over blocks: number of samples, variance within a block, and variance of the
+        # mean of a block, V^2.
         self._size, self._within, self._between = 1.0, 0.0, 0.0
 
     def variance(self, u: float, du: float, n: int) -> float:
@@ -299,7 +300,7 @@ class LoadNoise:
 
     @property
     def log_variance(self) -> tuple[float, float, float]:
-        """Return b for a single sample, with the noise of rounding added."""
+        """Return b for a single sample, with the variance of rounding added."""
         own = 1.0
         if self._between > 0.0:
             own += self._within * (1.0 - 1.0 / self._size) / self._between
@@ -323,7 +324,7 @@ class LoadNoise:
 
     @property
     def rounding(self) -> float:
-        """Return the variance of rounding, V^2, which is common to repeated values."""
+        """Return the variance of rounding, V^2, for values that repeat with the same error."""
         if math.isinf(self._step):
             # The value has never changed, so the step is unknown.
             return self._unseen
@@ -365,5 +366,5 @@ class LoadNoise:
 
 
 def log_density(z: float, variance: float) -> float:
-    """Return the log density of a block, nat, up to a constant; a clipped z counts less."""
+    """Return the log density of a block, nats, up to a constant; z: clipped standard score."""
     return -0.5 * (z * z + math.log(variance))

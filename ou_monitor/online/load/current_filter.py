@@ -2,11 +2,11 @@
 Level and resistance of a supply from its measured current, by a Kalman filter.
 
 Limits: scale and sign of the current are not corrected, so a wrong scale makes the resistance
-wrong.  A load that follows throttle but bypasses the current sensor makes it too high (on a robot
-that draws 1 A, 0.4 instead of 0.2 Ohm by a further sag of 0.1 V at full throttle); the error
-includes this only if throttle explains more of the residual than noise.  A constant current has no
-information.  (Throttle as a further regressor would absorb the other load, but on quads with slow
-current sensors it would also absorb at least half of the resistance.)
+wrong.  A load that follows throttle but bypasses the current sensor makes the resistance too high:
+on a robot that draws 1 A, a further sag of 0.1 V at full throttle makes it 0.4 instead of 0.2 Ohm.
+The stated error includes this only if throttle clearly explains a part of the residual.  A
+constant current has no information.  (Throttle as a further regressor would absorb the other load,
+but on quads with slow current sensors also at least half of the resistance.)
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from ou_monitor.online.load.blocks import (
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, POWER, reached
 from ou_monitor.records import FloatArray, NAN
 
-# Minimum current to start the filter, A; rise of the largest current, as a factor, at which the
-# state is rescaled and the prior is applied again.
+# Minimum current for starting the filter, A; factor by which the largest current must rise before
+# the state is rescaled and the prior is applied again.
 _LEAST, _MORE = 1e-2, 4.0
-# Prior standard deviation of the voltage drop at the largest current, relative to the voltage;
-# shares of the drop that appear at once and after each of LAGS, and their standard deviations.
+# Prior: standard deviation of the voltage drop at the largest current, relative to the voltage;
+# shares of the drop that appear at once and after each of LAGS; standard deviations of the shares.
 _FALL = 0.3
 _SHARES = np.array([1.0, 0.1, 0.05, 0.2, 0.3])
 _SHARE_STD = (0.3, 0.3, 0.1, 0.1, 0.15)
 _PRIOR = _FALL ** 2 * (np.outer(_SHARES, _SHARES) + np.diag(np.square(_SHARE_STD)))
 _DRAWN_STATES = 2 + _SHARES.size
 # Random walk of the level, V per sqrt(s) and cell: twice the walk in `LoadFilter`, because less is
-# known of the discharge.
+# known about the discharge.
 _DRAWN_WALK = 0.003
-# Typical minimum time to empty a pack at the largest current, s, for the prior of the discharge.
+# Typical minimum time in which the largest current empties a pack, s; for the prior of the
+# discharge.
 _EMPTY = 100.0
 # Variance of the change of each coefficient, per second: 2 % of a sag of 12 % in 100 s.
 _DRAWN_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(_SHARES.size)
-# Maximum relative error of a known resistance, and minimum relative error, because the filter's
-# own error omits the warming of a pack.
+# Relative error above which the resistance counts as unknown; minimum relative error, because the
+# filter's own error omits the warming of a pack.
 _KNOWN, LEAST_ERROR = 0.33, 0.1
 # Throttle at which an ESC ripples most (`ripple`).
 _LOUDEST = 0.7
@@ -46,11 +47,12 @@ _LOUDEST = 0.7
 # standard deviation of the coefficients, in residuals.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # Time constants, s, of the band in which throttle is tried as a further regressor, and minimum
-# share of its variance that current leaves unexplained: smaller shares are rounding or lag of the
-# current (up to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x; 0.007 to 0.8 on
-# roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
+# share of its variance that current leaves unexplained.  Smaller shares are due to rounding or lag
+# of the current (up to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x); shares of
+# 0.007 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and
+# regbot_28, 62 and 81.
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
-# Time for which unknown throttle or current is held, s.
+# Time for which the last throttle or current is held if the present one is unknown, s.
 UNKNOWN_HELD = 1.0
 
 
@@ -73,7 +75,7 @@ class CurrentFilter:
         self._beside, self._lags = np.zeros((3, 3)), np.zeros((2, 0))
 
     def time(self, block: LoadBlock) -> None:
-        """Update the delay of the current from a block as received."""
+        """Update the delay of the current from a block, before its load is delayed."""
         self._peak = max(self._peak, abs(block.current))
         if self._peak >= _LEAST and math.isfinite(block.current) and self.delay.take(
                 block.t, block.voltage, block.current / self._peak):
@@ -90,7 +92,7 @@ class CurrentFilter:
         self._settle(voltage)
 
     def _rescale(self) -> None:
-        """Rescale the state to a larger current, and apply the prior for it; keep the level."""
+        """Rescale the state to the largest current, and apply the prior again; keep the level."""
         m, P, ratio = self._m, self._P, self._largest / self._unit
         self._unit = self._largest
         m[1:] *= ratio
@@ -114,13 +116,13 @@ class CurrentFilter:
         return np.array([1.0, 0.0, *(-x / self._unit for x in self._drawn)])
 
     def take(self, block: LoadBlock, cells: float, *, fresh: bool) -> None:
-        """Take a block (cells in series); fresh: on a new time line, or perhaps another supply."""
+        """Take a block (cells in series); fresh: on a new time line, or after a long pause."""
         x, self.density = block.current, NAN
         if not math.isfinite(x):
             if not block.t - self._known_at <= UNKNOWN_HELD:
                 self.lost = True
             return
-        # A single wild reading must not rescale the filter: a second one must confirm it.
+        # A single wild reading must not rescale the filter, so wait for a second one.
         alone = max(self._before, self._largest) < abs(x) / _MORE and self._largest >= _LEAST
         self._before = abs(x)
         if alone:
@@ -128,7 +130,7 @@ class CurrentFilter:
         lost, self.lost, self._known_at = self.lost or fresh, False, block.last
         self._largest = max(self._largest, abs(x))
         if lost or not self._drawn:
-            # Assume a constant current before; a constant current then gives no information.
+            # Assume that the current was constant before, so that it has no information yet.
             self._drawn = [x] * (1 + len(LAGS))
         else:
             self._drawn = _lagged(self._drawn, x, block.t - self._t)
@@ -155,7 +157,7 @@ class CurrentFilter:
         self.rest = block.voltage - float(self._regressors()[2:] @ self._m[2:])
 
     def _compare(self, now: FloatArray, dt: float) -> None:
-        """Update the products for `_bypassed` by x, current and voltage."""
+        """Update the products that `_bypassed` uses; now: x, current and voltage."""
         if not dt or not self._lags.size:
             self._lags = np.stack((now, now))
         self._lags = self._lags - np.expm1(-dt / _BAND) * (now - self._lags)
@@ -165,11 +167,13 @@ class CurrentFilter:
     @property
     def _bypassed(self) -> float:
         """Return the relative error of the resistance due to loads that bypass the sensor."""
-        # It is the change of the resistance with throttle as a further regressor, times the share
-        # of the residual voltage that throttle explains.  Both are computed after a band-pass,
-        # because throttle also explains fast errors of the sensor, and the level changes slowly.
+        # It is the relative change of the resistance with throttle as a further regressor, times
+        # the share of the residual voltage that throttle explains.  Both are computed after a
+        # band-pass, because throttle also explains fast errors of the sensor, and the level
+        # changes slowly.
         (xx, xi, xv), (_, ii, iv), (_, _, vv) = self._beside.tolist()
-        # Residual squares of voltage and x, and their product, after regression on current.
+        # Residual squares of voltage and x, and their residual product, after regression on
+        # current.
         rest, moved, both = (vv - iv * iv / ii, xx - xi * xi / ii, xv - xi * iv / ii
                              ) if ii > 0.0 else (0.0, 0.0, 0.0)
         if not (rest > 0.0 and moved > _APART * xx and iv):
@@ -188,7 +192,7 @@ class CurrentFilter:
         P[2:, 2:] += _DRAWN_DRIFT * (self._volts ** 2 * dt)
         h = self._regressors()
         noise = self.noise
-        # The noise depends on current as on throttle; it is largest at the largest current.
+        # Use the law of the noise over throttle, with the largest noise at the largest current.
         now = self._drawn[0] / self._largest
         u, du = _LOUDEST * abs(now), abs(now - self._load)
         R = noise.variance(u, du, block.n)
@@ -232,7 +236,7 @@ class CurrentFilter:
         return np.append(1.0, reached(hold(self._seen)))
 
     def sag(self, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the sag, V, from the current at full throttle, and its standard error."""
+        """Return the sag, V, from the current expected at throttles, and its standard error."""
         ohm, ohm_se = self.resistance
         A = self._squares[:4, :4] + np.diag([0.0, *[_ONE / _WIDE ** 2] * 3])
         inverse = np.linalg.pinv(A)
@@ -250,7 +254,7 @@ class CurrentFilter:
         return float(self._m[0])
 
     def path(self, t: FloatArray, current: FloatArray) -> FloatArray:
-        """Return the mean voltage ahead, V, at stamps, s, from the current there, A."""
+        """Return the predicted mean voltage, V, at stamps, s, for the currents there, A."""
         drawn, now, out = self._drawn, self._t, np.full(t.size, NAN)
         if math.isfinite(self._unit):
             for k, (stamp, x) in enumerate(zip(t.tolist(), current.tolist())):

@@ -1,9 +1,9 @@
 """
 The voltage under load, learned in flight by a Kalman filter, without a relaxation rate.
 
-Limits: late throttle makes the sag too small (100 ms: by a third on a racing quad); outside the
-throttle range flown, the sag is extrapolated; changes of the true sag are followed within minutes.
-doc/load.md has the equations and the figures.
+Limits: late throttle makes the sag too small (by a third with 100 ms on a racing quad); outside
+the throttle range flown, the sag is extrapolated; changes of the true sag are followed within
+minutes.  doc/load.md has the equations and the figures.
 """
 
 from __future__ import annotations
@@ -29,30 +29,33 @@ from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
 
 # Lag of the whole response, s: half of the response time of an ESC.
 _LAG = 0.004
-# Random walk of the level, V per sqrt(s) and cell: usually, as in an OU of 4.6 mV and 20 s (from
-# the batch fit), and for a nearly empty pack (chosen on bf_hiro_4s; 0.02 to 0.05 work).
+# Random walk of the level, V per sqrt(s) and cell: usual, as in an OU of 4.6 mV and 20 s (from the
+# batch fit); and for a nearly empty pack (chosen on bf_hiro_4s; 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
-# Distance from a faster level that predicts better, V per cell, from which the level walks as
-# fast: with 0.005, a sag that appears when motors are armed was late; with 0.01, a fall still
-# passed for sag (simulated packs that empty in their last 8 to 30 s).
+# Distance of the level from `FastLevel`, if that predicts better, above which the level uses the
+# fast walk too, V per cell.  With 0.005, a sag that appears when motors are armed was learned
+# late; with 0.01, a fall of the level was still taken for sag (simulated packs that empty in their
+# last 8 to 30 s).
 _BEHIND = 0.0075
-# `FastLevel`: prediction time, s; maximum ratio of mean square errors to use it; memory, s;
+# `FastLevel`: prediction time, s; ratio of mean square errors below which it is used; memory, s;
 # minimum time compared, s; interval of predictions, s.
 _AHEAD, _PAYS, _COMPARED, _LEAST_COMPARED, _EVERY = 1.0, 0.98, 30.0, 10.0, 0.1
-# Variance of changes per second: 25 % of all loads in 100 s; 2 % of full sag for each coefficient.
+# Variance of the change of the coefficients per second: all in common, 25 % in 100 s; each alone,
+# 2 % of the full sag in 100 s.
 _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
-# Time constant of the scale of the load, which follows the level, s.  If it were shorter, every
-# correction would change the regressors at constant throttle, from which the filter would learn.
+# Time constant with which the scale of the load follows the level, s.  If it were shorter, each
+# correction of the level would change the regressors even at constant throttle, and the filter
+# would learn from that.
 _RESIZE = 30.0
 # Memory of the throttle flown, s.
 _FLOWN_MEMORY = 120.0
-# The sag counts as known if its error over the throttle range flown is below this share of the sag
-# (raised from 0.25 because of one recording), or below this share of the noise.
+# The sag counts as known if its error over the throttle range flown is below the first share of
+# the sag (raised from 0.25 because of one recording), or below the second share of the noise.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
-# Minimum range of throttle that has moved.
+# Minimum range of throttle flown for an estimate of the sag.
 _MOVED = 0.02
-# Minimum relative error of the sag: the filter omits changes during a flight, so its own standard
-# error was up to 9 times too small.
+# Minimum relative error of the sag, because the filter's own standard error, which omits changes
+# during a flight, was up to 9 times too small.
 _LEAST_ERROR = 0.1
 # Gap, s, after which the level is unknown: the battery may have been changed.
 _PAUSE = 60.0
@@ -62,29 +65,30 @@ _OTHER_CRAFT = 1.6
 _OTHER_DAY = 0.2 ** 2
 # Number of throttle bins, and number of bins that are combined for the noise (0.1 of throttle).
 _BINS, _NEAR = 50, 5
-# dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
+# dE/ds of a cell, V, at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
 _MEAN, _COV, _SIZE = usual_coefficients()
 _STATES = 2 + _MEAN.size
-# Variance of the changes per second, relative to the square of the steady sag.
+# Variance of the changes of each coefficient per second, relative to the square of the steady sag.
 _DRIFT = _CHANGE * np.eye(_MEAN.size) * (_SIZE / _MEAN[:-1].sum()) ** 2
 
 
 class FastLevel:
-    """A level that follows faster than the filter's, and is used once it predicts better."""
+    """A level that follows faster than the filter's, and is used while it predicts better."""
 
     def __init__(self) -> None:
-        # Stamp, s; level plus the fall by discharge, V; variance, V^2; that fall, V; s compared.
+        # Stamp, s; level plus the fall by discharge, V; variance, V^2; that fall, V; time
+        # compared, s.
         self._t = self._level = self._variance = NAN
         self._drawn = self._since = 0.0
-        # Stamp, level of the filter and faster level; mean squares of their errors, V^2.
+        # Stamp, level of the filter, and faster level; mean squares of the errors of both, V^2.
         self._past: deque[tuple[float, float, float]] = deque()
         self._errors = (0.0, 0.0)
         self._better = False
 
     def fall(self, volts: float) -> None:
-        """Lower the level by the charge drawn, V."""
+        """Lower the level by a fall due to the charge drawn, V."""
         self._drawn += volts
 
     def take(self, t: float, rest: float, variance: float, level: float, walk: float) -> None:
@@ -115,8 +119,9 @@ class FastLevel:
 
 
 def _beyond(flown: tuple[float, float], error: FloatArray) -> FloatArray:
-    """Return errors over TABLE, raised so that they do not fall outside the throttles flown."""
-    # They may fall, because the correction of a sag, which counts as an error, may change sign.
+    """Return errors over TABLE, raised so that they do not decrease above the throttles flown."""
+    # They might decrease there, because the correction of a sag, which counts as an error, may
+    # change sign.
     low, high = np.searchsorted(TABLE, flown, 'right').tolist()
     return np.append(error[:high], np.maximum.accumulate(
         np.append(error[low - 1:high].max(), error[high:]))[1:])
@@ -135,17 +140,17 @@ class LoadFilter:
         # None until a current has been measured.
         self._current: CurrentFilter | None = None
         self._delay = LoadDelay()
-        # Blocks that wait for their load, and received loads that may still be needed.
+        # Blocks whose load has not arrived yet, and blocks whose load may still be needed.
         self._waiting: deque[LoadBlock] = deque()
         self._received: deque[LoadBlock] = deque()
-        # Log density of the last block, nats; its mean gain with current; time compared, s.
+        # Log density of the last block, nats; mean gain by using the current; time compared, s.
         self._density, self._better, self._compared = NAN, NAN, 0.0
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None,
              current: npt.ArrayLike | None = None) -> None:
         """Add samples in order, s, V, 0..1, A; an unknown load keeps its last value for 1 s."""
-        # For a few samples, this is several times as fast as `broadcast_arrays`.
+        # For few samples, this is several times as fast as `broadcast_arrays`.
         columns = np.full((4, np.size(t)), NAN)
         for row, given in zip(columns, (t, voltage, throttle, current)):
             if given is not None:
@@ -156,7 +161,7 @@ class LoadFilter:
             self._arrive(block)
 
     def begin_with(self, start: LoadStart | None) -> None:
-        """Start from the model of another flight; only before the first voltage."""
+        """Start from the model of another flight; has no effect after the first voltage."""
         if not math.isfinite(self._t):
             self._start = start
             self._delay = LoadDelay(0.0 if start is None else start.delay)
@@ -197,7 +202,7 @@ class LoadFilter:
             self._take(replace(first, throttle=throttle.throttle, current=current.current))
 
     def _take(self, block: LoadBlock) -> None:
-        """Take one block: the very first one, the first of a new time line, or a later one."""
+        """Take one block: the very first, the first of a new time line, or a later one."""
         u, before, self._density = block.throttle, self._t, NAN
         fresh = self._opening or not block.t - self._t <= _PAUSE
         if not math.isfinite(self._t):
@@ -214,7 +219,7 @@ class LoadFilter:
                 du = abs(u - self._throttle)
                 pieces = [(block.t, u)]
                 if u != self._throttle and self._last > self._t:
-                    # The previous throttle was constant to the end of its block.
+                    # The previous throttle lasted to the end of its block.
                     pieces.insert(0, (self._last, self._throttle))
                 self._throttle = u
                 self._predict(pieces)
@@ -226,7 +231,7 @@ class LoadFilter:
         self._known_at = block.last if math.isfinite(block.throttle) else self._known_at
 
     def _compare(self, current: CurrentFilter, dt: float) -> None:
-        """Update the difference in log density between current and throttle."""
+        """Update the gain in log density by using the current instead of throttle."""
         if current.lost:
             self._better, self._compared = NAN, 0.0
         gain = current.density - self._density
@@ -238,7 +243,7 @@ class LoadFilter:
     def _begin(self, v: float, u: float) -> None:
         """Start a flight with the prior, scaled by the first voltage."""
         self._volts = max(v, 1e-3)
-        # Below 2.5 V it is not a lithium cell, so the curve is scaled.
+        # Below 2.5 V it is not a lithium cell, so scale the curve of a cell.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
         start = self._start
@@ -258,9 +263,9 @@ class LoadFilter:
         self._settle(v, u)
 
     def _forget(self) -> None:
-        """Reset coefficients and noise to the prior; the next block starts the level."""
+        """Reset coefficients and noise to the prior; the next block sets the level again."""
         self._contrasts = LoadContrasts()
-        # Noise with known throttle, and with unknown throttle, whose effect is then noise too.
+        # Noise with known throttle, and with unknown throttle, whose effect then counts as noise.
         self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
         # Time for which throttle has been known, s.
         self._seen = 0.0 if self._start is None else math.inf
@@ -286,7 +291,7 @@ class LoadFilter:
             self._begin(v, u)
             return
         if self._opening:
-            # The battery may be another one.
+            # The battery may have been changed.
             self._contrasts, self._highest = LoadContrasts(), NAN
         if math.isfinite(u) is not math.isfinite(self._throttle):
             self._noise, self._other = self._other, self._noise
@@ -300,7 +305,7 @@ class LoadFilter:
         held = u if math.isfinite(u) else 0.0
         self._lagged = self._settled = held
         x = held ** POWER
-        # The state of the slowest lag is unknown: use the mean of rest and a steady load.
+        # The state of the slowest lag is unknown: use the mean of no load and a steady load.
         self._lags = [x] * (len(LAGS) - 1) + [0.5 * x] + [held] * len(LINEAR_LAGS)
         m, P = self._m, self._P
         h = self._regressors()
@@ -320,13 +325,13 @@ class LoadFilter:
     def _regressors(self) -> FloatArray:
         u, g = self._lagged, -self._factor
         if math.isnan(self._throttle):
-            # Without throttle, the level is the voltage under the present load.
+            # If throttle is unknown, the level is the voltage under the present load.
             g = 0.0
         return np.array([1.0, 0.0, g * u ** POWER, g * u, g * u ** 3,
                          *(g * x for x in self._lags), g * max(u - self._settled, 0.0)])
 
     def _advance(self, dt: float, u: float) -> float:
-        """Advance the regressors by dt, s, exact once the lag has settled; return the load."""
+        """Advance the regressors by dt, s (exact once `_LAG` has settled); return the load."""
         self._lagged = u + (self._lagged - u) * math.exp(-dt / _LAG)
         self._settled = self._lagged + (self._settled - self._lagged) * math.exp(
             -dt / INRUSH_TIME)
@@ -337,7 +342,7 @@ class LoadFilter:
         return float(x)
 
     def _fall(self, level: float) -> float:
-        """Return the fall of the level, V, per unit of charge, for the cells in series."""
+        """Return the fall of the level per unit of charge, V, for all cells in series."""
         place = int((level / self._cells - _LOWEST) * _PER_VOLT + 0.5)
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
@@ -360,20 +365,20 @@ class LoadFilter:
         self._fast.fall(used * float(m[1]))
         P[0] -= P[1] * used
         P[:, 0] -= P[:, 1] * used
-        # In a gap, a pack may recover by more than its random walk: by up to 2 % in a minute.
         self._resize(dt)
-        # A fall that the level cannot follow would pass for sag.
+        # A fall that the level cannot follow would be taken for sag.  In a gap, a pack may recover
+        # by more than its random walk: by up to 2 % in a minute.
         behind = abs(self._fast.of(float(m[0]), 0.0)[0] - float(m[0])) > _BEHIND * self._cells
         P[0, 0] += ((_FAST_WALK if behind else _WALK) * self._cells) ** 2 * dt + (
             0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
         a = m[2:]
-        # Steady sag at full throttle, V: its mean square, so that a small sag can still grow.
+        # Steady sag at full throttle, V.  Use its expected square, so that a small sag can grow.
         sag = float(a[:-1].sum())
         square = sag * sag + max(0.0, float(P[2:-1, 2:-1].sum()))
         P[2:, 2:] += dt * (_WARMING * a[:, None] * a + square * _DRIFT)
 
     def _correct(self, block: LoadBlock, du: float) -> None:
-        """Take a block, V, whose throttle differs from the last one by du."""
+        """Take a block whose throttle differs by du from the previous block's."""
         m, P, noise = self._m, self._P, self._noise
         u = 0.0 if math.isnan(self._throttle) else self._throttle
         du = 0.0 if math.isnan(du) else du
@@ -397,7 +402,7 @@ class LoadFilter:
             self._contrasts.take(block.t, block.voltage, h[2:], total,
                                  float(m[0]) / self._cells)
             self._highest = max(self._highest, float(m[0]))
-            # Take only the share due to noise, not to the uncertainty of the state.
+            # Use only the share that is due to noise, not to the uncertainty of the state.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
@@ -405,7 +410,8 @@ class LoadFilter:
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
         self._density = log_density(clipped, s + R * scale)
-        # Large errors of one sign for half a second: perhaps another battery, so free the level.
+        # After large errors of one sign for half a second, perhaps due to another battery, let the
+        # level move.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
             P[0, 0] += (0.05 * self._volts) ** 2
@@ -427,14 +433,14 @@ class LoadFilter:
             return (math.exp(0.5 * b[0]),) * u.size
         law = np.exp(b[0] + b[1] * ripple(u))
         seconds, samples, squares = self._flown
-        # For throttles flown for less than a second, use the rms at constant throttle.
+        # For throttles flown for less than about a second, use the law at constant throttle.
         known = float(samples.sum()) / max(float(seconds.sum()), 1.0)
         near = [np.convolve(one, np.ones(_NEAR), 'same') for one in (samples, squares)]
         return tuple(np.sqrt((near[1] + known * law) / (near[0] + known)).tolist()) if known \
             else tuple(np.sqrt(law).tolist())
 
     def _between(self, share: float) -> tuple[float, float]:
-        """Return the range of throttles flown, without a share of the time at each end."""
+        """Return the range of throttles flown, without a share of the time at either end."""
         total = np.cumsum(self._flown[0])
         if not total[-1] > 0.0:
             return self._throttle, self._throttle
@@ -450,7 +456,7 @@ class LoadFilter:
         raw = H @ a
         sag = np.maximum.accumulate(H @ rising(a, C, H))
         low, high = self._flown_range()
-        # The correction of a negative or decreasing sag counts as an error too.
+        # The correction of a negative or decreasing sag counts as an error.
         error = _beyond((low, high), np.sqrt(np.maximum(
             np.einsum('ij,jk,ik->i', H, C, H), (sag - raw) ** 2)))
         basis, level, rest = Basis.THROTTLE, self._level, self._rest
@@ -495,13 +501,13 @@ class LoadFilter:
     def _flown_range(self) -> tuple[float, float]:
         low, high = self._between(0.1)
         if high - low < _MOVED:
-            # A short climb counts if it determined the sag.
+            # Include short climbs, which may have determined the sag.
             low, high = self._between(0.02)
         return self._start.flown if high - low < _MOVED and self._start is not None else (
             low, high)
 
     def _by_throttle(self, low: float, high: float) -> tuple[LoadStatus, float]:
-        """Return the status without current, and the error, V, that is accepted for any sag."""
+        """Return the status by throttle alone, and the error, V, that is allowed for any sag."""
         (a, C), b, held = self._sag_law(), self._noise.log_variance, hold(self._seen)
         d = static(high, held) - static(low, held)
         swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
@@ -515,11 +521,11 @@ class LoadFilter:
 
     @property
     def _level(self) -> float:
-        """Return the level, V, that predicts better."""
+        """Return the level that predicts better, V."""
         return self._fast.of(float(self._m[0]), 0.0)[0]
 
     def _by_current(self, load: SupplyLoad, current: CurrentFilter, most: float) -> SupplyLoad:
-        """Return the sag from the current at each throttle."""
+        """Return the load with the sag from the current expected at each throttle."""
         raw, se = current.sag(TABLE)
         sag = np.maximum.accumulate(np.maximum(raw, 0.0))
         error = np.maximum(_beyond(load.flown, np.hypot(se, sag - raw)), _LEAST_ERROR * sag)
@@ -546,8 +552,8 @@ class LoadFilter:
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None
-        # Use the size over the whole flight, because the coefficients follow the last half
-        # minute.  It is a weighted mean with the present size, whose error is SIZE_ERROR.
+        # The coefficients follow the last half minute, so average their size, whose relative error
+        # is SIZE_ERROR, with the size over the whole flight, weighted by the errors.
         found, size, size_se = self._contrasts.against(self._m[2:]), 1.0, SIZE_ERROR
         if found.ratio > 0.0:
             size += (found.ratio - 1.0) / (1.0 + (found.se / SIZE_ERROR) ** 2)
@@ -575,14 +581,14 @@ class LoadFilter:
 
     def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:
-        """Return the mean voltage ahead, V, from throttle or current, A; NaN: unknown."""
+        """Return the predicted mean voltage, V, from throttle or current, A; NaN: unknown."""
         if not math.isfinite(self._t):
             raise ValueError('no voltage has arrived: the prediction has no start')
         load, delay = (throttle, self._delay.delay) if current is None else (
             current, 0.0 if self._current is None else self._current.delay.delay)
         if load is None:
             raise ValueError('a path needs throttle or current')
-        # The load at each time is received after the delay; at the end, the last one received.
+        # The load at each time is the one received `delay` later; at the end, the last one.
         load = load[np.searchsorted(t, t + delay, 'right') - 1] if delay else load
         if current is not None and self._current is not None:
             return self._current.path(t, load)

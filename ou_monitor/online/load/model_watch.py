@@ -17,30 +17,31 @@ import numpy.typing as npt
 from ou_monitor.model.load import LoadStart, SIZE, WARMING, WARMING_SE
 from ou_monitor.records import FloatArray, NAN
 
-# Length, s, of the stretches within which voltages and the model's response are compared, so that
-# the level cancels out (1 s and 4 s give the same); maximum number kept, five minutes.
+# Length, s, of the stretches within which voltage and the model's response are compared, so that
+# the level cancels out (1 s and 4 s give the same); maximum number kept, for five minutes.
 _STRETCH, _MOST = 2.0, 150
-# Minimum effective number of stretches, because their scatter gives the error.
+# Minimum effective number of stretches; the error comes from their scatter.
 _FEWEST = 4.0
-# Minimum relative error of the model, because its form is inexact if throttle is used differently.
+# Relative error of the model's form, which is inexact if throttle is used differently.
 _FORM = 0.05
 # Relative error of a sag that the filter has learned without contrasts.
 SIZE_ERROR = 0.1
-# Minimum relative error of the noise: its scatter between simulated flights of one model.
+# Further relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
-# Minimum relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
+# Further relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
 # (halves of gecko, nazgul and hiro, three flights of roma), with packs at different charges.
 _DISCHARGE_FORM = 0.64
-# Lower limit of the noise, V.
+# Minimum noise, V.
 _LEAST_NOISE = 1e-6
-# A pack is weaker if its sag exceeds the model's by both of these: a share, and a number of
-# standard errors of the logarithm (exceeded by chance in 1 % of cases).
+# A pack is weaker if its sag exceeds the model's both by this share and by this number of standard
+# errors of the logarithm (chance exceeds that number in 1 % of cases).
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
-# Ratio of sag to the model's below which pack or load differs (warm packs have 0.75 or more).
+# Ratio of the sag to the model's below which it is another pack or load (warm packs have at least
+# 0.75).
 _OTHER = 0.7
-# Ratio of the level to the model's, up or down, beyond which it is another pack.
+# Ratio of two levels, up or down, beyond which it is another pack.
 OTHER_LEVEL = 1.3
 # Limits of a lithium cell's level at rest, V: minimum at take-off, minimum, and maximum (LiHV).
 _TAKE_OFF, _EMPTY, _FULL = 3.4, 3.2, 4.4
@@ -60,20 +61,21 @@ class ModelComparison:
     """This flight compared with the model of its supply; ratios are this flight over the model."""
 
     verdict: ModelVerdict = ModelVerdict.CANNOT_TELL
-    sag_ratio: float = NAN  # Of the response to throttle
-    sag_ratio_se: float = NAN  # Its standard error, the model's included
-    resistance_ratio: float = NAN  # NaN without a current in either flight
+    sag_ratio: float = NAN  # Ratio of the responses to throttle
+    sag_ratio_se: float = NAN  # Its standard error, which includes the model's
+    # Ratio of the resistances; NaN unless the current is known in both flights.
+    resistance_ratio: float = NAN
     resistance_ratio_se: float = NAN
-    # Of the residual while throttle moves; NaN if the model does not contain it.
+    # Ratio of the residual rms while throttle moves; NaN if the model lacks it.
     noise_ratio: float = NAN
     noise_ratio_se: float = NAN
-    # Of the discharge per load, known to a factor of two.
+    # Ratio of the discharge per load, known to a factor of two.
     discharge_ratio: float = NAN
     discharge_ratio_se: float = NAN
     words: str = ''  # One sentence; empty: nothing to report
 
     def fields(self) -> dict[str, object]:
-        """Return the published fields; the interval of the ratio of sags is two numbers."""
+        """Return the published fields; the interval of the sag ratio consists of two numbers."""
         values = {f'model_{f.name}': getattr(self, f.name) for f in fields(self)}
         low, high = self.sag_ratio_95
         return values | {'model_verdict': self.verdict.name,
@@ -81,7 +83,7 @@ class ModelComparison:
 
     @property
     def sag_ratio_95(self) -> tuple[float, float]:
-        """Return the 95 % interval of the ratio of sags."""
+        """Return the 95 % interval of the sag ratio."""
         return self.sag_ratio - 1.96 * self.sag_ratio_se, self.sag_ratio + 1.96 * self.sag_ratio_se
 
 
@@ -89,11 +91,12 @@ class ModelComparison:
 class Contrast:
     """Measured response to throttle relative to a predicted one; NaN: too few stretches."""
 
-    ratio: float = NAN  # Slope of the voltage over the predicted response
+    ratio: float = NAN  # Slope of voltage over predicted response
     se: float = NAN
     noise: float = NAN  # Residual rms while throttle moves, outliers downweighted, V
     noise_se: float = NAN
-    level: float = NAN  # Mean open-circuit voltage of a cell, V, weighted as the slope
+    # Mean open-circuit voltage of a cell, V, with the weights of the slope.
+    level: float = NAN
     # Relative change of the slope with that voltage, 1/V, and its standard error.
     warming: float = WARMING
     warming_se: float = WARMING_SE
@@ -103,7 +106,8 @@ class LoadContrasts:
     """Weighted products of voltage and regressors within stretches of 2 s, means removed."""
 
     def __init__(self) -> None:
-        # For each: sum of weights, 1/V^2; level of a cell, V; products of voltage and regressors.
+        # For each stretch: sum of weights, 1/V^2; level of a cell, V; products of voltage and
+        # regressors.
         self._stretches: deque[tuple[float, float, FloatArray]] = deque(maxlen=_MOST)
         self._begin, self._sums = NAN, np.zeros((2 + SIZE, 2 + SIZE))
         self._origin = 0.0
@@ -134,7 +138,7 @@ class LoadContrasts:
         ratio, share = float(along.sum()) / total, squares / total
         if 1.0 / float(share @ share) < _FEWEST:
             return Contrast()
-        # Residual of each stretch from the slope of the others (jackknife).
+        # Residual of each stretch from the slope of the other stretches (jackknife).
         left = (along - ratio * squares) / (1.0 - share)
         # Average logarithms, so that glitches in one stretch do not dominate.
         squared = (products[:, 0, 0] - 2.0 * ratio * along + ratio * ratio * squares) / weights
@@ -148,14 +152,14 @@ class LoadContrasts:
 
 
 def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple[float, float]:
-    """Return the slope of relative residuals over level, 1/V, and its error, prior included."""
+    """Return the slope of relative residuals over level, 1/V, and its error, using the prior."""
     weight = float(squares @ levels ** 2)
     if not weight > 0.0:
         return WARMING, WARMING_SE
     slope = float(levels @ left) / weight
     each = levels * (left - slope * levels * squares)
-    # The form of the model may be wrong by _FORM at both ends of the range of levels, which is
-    # sqrt(12) standard deviations wide if levels are uniform.
+    # The model's form may be wrong by _FORM at both ends of the range of levels; this range is
+    # sqrt(12) standard deviations wide if the levels are uniform.
     variance = (float(each @ each) / weight + _FORM ** 2 * float(squares.sum()) / 6.0) / weight
     own, usual = 1.0 / variance, WARMING_SE ** -2
     return (slope * own + WARMING * usual) / (own + usual), (own + usual) ** -0.5
@@ -164,11 +168,11 @@ def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple
 def other_pack(start: LoadStart, highest: float, level: float) -> str:
     """Return why the highest or present level, V, indicates another pack; '': it does not."""
     cells = start.cells
-    # For a rail, the number of cells is meaningless.
+    # A regulated rail has no meaningful number of cells.
     if not _EMPTY <= start.volts / cells <= _FULL:
         other = not 1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL
     elif highest / cells < _TAKE_OFF:
-        # The highest level counts, because the flight may have emptied a charged pack.
+        # Use the highest level, because the flight may have emptied a charged pack.
         return (f'The highest voltage at rest, {highest:.2f} V, is {highest / cells:.2f} V for '
                 f"each of the model's {cells:.0f} cells: another pack, or an empty one.")
     else:
@@ -178,7 +182,7 @@ def other_pack(start: LoadStart, highest: float, level: float) -> str:
 
 
 def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
-    """Return the verdict on a ratio of sags with its standard error, and the sentence."""
+    """Return the verdict on a sag ratio with its standard error, and a sentence."""
     if not se <= _VAGUE * max(ratio, 1.0):
         return ModelVerdict.CANNOT_TELL, ''
     more, model = ratio - 1.0, 'the model' + (f' of {date}' if date else '')
@@ -195,7 +199,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str,
             discharge: float, discharge_se: float) -> ModelComparison:
     """Compare this flight with an earlier model (ohm: now; other: from `other_pack`)."""
-    # Correct for the difference in level, because the sag changes as a pack empties and warms.
+    # Correct the ratio to equal levels, because the sag changes as a pack empties and warms.
     apart = found.level - (start.level or start.volts / start.cells)
     as_found = math.exp(-start.warming * apart)
     ratio = found.ratio * as_found

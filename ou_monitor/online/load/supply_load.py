@@ -1,8 +1,8 @@
 """
 The voltage under load: level, sag, noise, and whether the sag is known.
 
-Limits: outside the throttles flown the sag is extrapolated.  Its error omits changes of the sag
-during the flight, and is at least a tenth of the sag.
+Limits: outside the throttles flown, the sag is extrapolated.  The stated error omits changes of
+the sag during the flight; it is at least a tenth of the sag.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ import numpy.typing as npt
 from ou_monitor.model.load import LAGS, LINEAR_LAGS
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-# Exponent p of throttle in the load (of the level: p - 1), from the prior of `load_fit`.
+# Exponent p of throttle in the load, from the prior of `load_fit`; the level has the exponent
+# p - 1.
 POWER = 1.8
 # Time at constant throttle for which the sag is stated, s: motors and converters have settled, and
-# longer bursts of throttle are rare.  If the load has been known for less than _HOLDS such times,
-# the sag is stated for 1/_HOLDS of the time known, because more would be an extrapolation.
+# longer bursts of throttle are rare.  If the load has been known for less than _HOLDS times HOLD,
+# the sag is stated for 1/_HOLDS of that time, because for a longer time it would be extrapolated.
 HOLD, _HOLDS = 1.0, 10.0
-# Time at constant current for which the immediate resistance is stated, s: what a user would read
-# from the changes between samples at 10 Hz.
+# Time at constant current for which the immediate resistance is stated, s: the resistance that a
+# user would compute from changes between samples at 10 Hz.
 AT_ONCE = 0.1
 # Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
-# Number of sweeps in `rising` (10 come within 3 % of the limit on cf_pair).
+# Number of sweeps in `rising` (with 10, results on cf_pair are within 3 % of convergence).
 _SWEEPS = 10
-# Sentences on the relaxation for estimates in which only level, sag and noise are known.
+# Sentences on the relaxation for statuses in which only level, sag and noise are known.
 _NO_ALPHA = {
     Status.NO_RELAXATION: 'The relaxation is not visible{at}: only a higher rate can show it.',
     Status.BURIED: 'The relaxation is buried in noise{at}.',
@@ -77,7 +78,7 @@ class LoadStatus(enum.Enum):
 
 
 class Basis(enum.Enum):
-    """Input from which the level is computed: the best predictor of the last half minute."""
+    """Input from which the level is computed: the best one over the last half minute."""
 
     NONE = 'neither throttle nor current'
     THROTTLE = 'throttle'
@@ -88,18 +89,18 @@ class Basis(enum.Enum):
 class SupplyLoad:
     """Result of the load filter."""
 
-    status: LoadStatus = LoadStatus.NO_DATA  # Whether the sag is known, and why not.
-    # Open-circuit voltage, V; without throttle the voltage under load; NaN without voltage.
+    status: LoadStatus = LoadStatus.NO_DATA  # Whether the sag is known, or why not.
+    # Open-circuit voltage, V; if throttle is unknown, the voltage under load; NaN: no voltage.
     level: float = NAN
     # Last voltage without the response to load (sag-compensated), V; the level is its mean.
     rest: float = NAN
-    # Resistance 1 s after a step of current, Ohm; NaN without a current that affects the voltage.
+    # Resistance 1 s after a step of current, Ohm; NaN without a current that moves the voltage.
     resistance: float = NAN
     resistance_se: float = NAN  # Its standard error, Ohm.
     resistance_at_once: float = NAN  # Resistance after `AT_ONCE`, Ohm.
     time_constants: tuple[float, ...] = LAGS  # Time constants of the response, s; fixed.
     delay: float = 0.0  # Delay of throttle behind the voltage, s.
-    # Input of the level, and of the sag if throttle does not determine it.
+    # Input from which the level is computed, and the sag too if throttle does not determine it.
     basis: Basis = Basis.NONE
     # Throttles between which 80 % of the last two minutes were flown.
     flown: tuple[float, float] = (0.0, 1.0)
@@ -114,7 +115,7 @@ class SupplyLoad:
         return self.status is LoadStatus.KNOWN
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag, V, after 1 s; mainly the prior unless `known`; NaN: unknown."""
+        """Return the sag after 1 s, V; mostly the prior unless `known`; NaN: unknown."""
         return self._read(throttle, self._sag)
 
     def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
@@ -165,8 +166,8 @@ class LoadState:
     # Stamp, s, and throttle now.
     t: float
     throttle: float
-    # State: level, V; discharge per load, 1/s; coefficients, V, as in `LoadStart`.  Its covariance
-    # is increased if innovations are larger than predicted.
+    # State: level, V; discharge per load, 1/s; coefficients, V, as in `LoadStart`.  The covariance
+    # is enlarged if innovations were larger than predicted.
     mean: FloatArray
     covariance: FloatArray
     lags: tuple[float, ...]  # x = u^1.8 after LAGS, and throttle u after LINEAR_LAGS.

@@ -1,25 +1,25 @@
 """
 The last minutes of a flight, possible courses of throttle, and the lowest voltage in each.
 
-doc/risk.md has the formulas: of the lowest voltage (step 1), of the pilot's future throttle (3),
-and of the excursions (4).
+doc/risk.md has the formulas for the lowest voltage (step 1), the pilot's future throttle (3), and
+the excursions (4).
 
-A course jumps to a peak of throttle, then to another throttle.  Its samples form four groups:
-during the inrush, in the two halves of the rest of the peak, and after the peak.  Limits: within a
-group the mean path counts as constant; samples of noise are independent, as in the load filter.
+A course is throttle that jumps to a peak, then to another value.  Its samples form four groups:
+during the inrush, in the two halves of the remaining peak, and after the peak.  Limits: within a
+group, the mean path counts as constant; samples of noise are independent, as in the load filter.
 
 Pilot's future throttle: each completed horizon provides one course.  One rise from the present
 throttle into each fifth of the range above it is added (rule of succession).  Limits: within a
 horizon, the peak is assumed to come first.
 
 Excursions do not need the load: the risk follows from the margin of the present voltage, and from
-the drops of this flight.  One further drop, twice the standard deviation of the last 5 s, stands
-for what has not been flown yet.  Horizons below 1 s and above 5 s use the nearest coefficients.
-Limits: throttle is not used; beyond 8 deviations, the risk is assumed to fall as the tail of
-Student's t in the other laws does.
+the drops of this flight.  One further drop, twice the standard deviation of the last 5 s, is added
+for everything that has not been flown yet.  Horizons below 1 s or above 5 s use the nearest
+coefficients.  Limits: throttle is not used; beyond 8 deviations, the risk is assumed to fall like
+the tail of Student's t in the other laws.
 
-Limits of the blocks: with a source slower than a block, empty blocks repeat its last value, up to
-a maximum silence; a horizon with a longer silence counts as incomplete.
+Limits of the blocks: if the source is slower than a block, empty blocks repeat its last value, up
+to a maximum silence; a horizon with a longer silence counts as incomplete.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from ou_monitor.records import FloatArray, NAN
 
 # Duration of the first group after a rise, in time constants of the inrush.
 _RISE = 2.0
-# Duration of a rise, s, and factor on the inrush of a step, because a rise is a ramp: time
-# constant / duration.
+# Duration of a rise, which is a ramp, s; so the inrush of a step is multiplied by its time
+# constant over this duration.
 _RAMP = 0.2
 _SHARE_OF_RISE = INRUSH_TIME / _RAMP
 
@@ -52,8 +52,9 @@ def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return ln n, and mean and deviation of the largest of n running medians of three normals.
 
-    A median is below x unless two of its three samples are above x.  This is a chain of three
-    states (samples since the last above x), computed for n = 1, 2, 4, ... steps by squaring.
+    A median is below x unless two of its three samples are above x.  That gives a chain of three
+    states (number of samples since the last one above x), which is computed for n = 1, 2, 4, ...
+    steps by squaring.
     """
     x = np.linspace(-6.0, 8.0, 561)
     over = normal_below(-x)
@@ -65,7 +66,7 @@ def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     power = step
     for k in range(17):
         below = (first @ power)[:, 0].sum(axis=1)
-        # Integrals of 1 - F from the lowest x on.
+        # Integrals of 1 - F, from the lowest x on.
         mean = x[0] + _integral(1.0 - below, x)
         square = x[0] ** 2 + _integral(2.0 * x * (1.0 - below), x)
         counts.append(k * np.log(2.0))
@@ -80,15 +81,14 @@ _LN_N, _MEAN, _DEVIATION = _largest_medians()
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """Possible future throttle: k courses."""
+    """Possible future throttle: k courses; all shapes (k,)."""
 
-    # Throttle at the peak, and after it, 0..1.
-    peak: FloatArray
+    peak: FloatArray  # Throttle at the peak, 0..1.
     dwell: FloatArray  # Time at the peak, s.
-    rest: FloatArray
+    rest: FloatArray  # Throttle after the peak, 0..1.
 
     def after(self, first: Courses) -> Courses:
-        """Return another set of courses followed by these."""
+        """Return the courses of another set, followed by these."""
         return Courses(*(np.concatenate(pair) for pair in (
             (first.peak, self.peak), (first.dwell, self.dwell), (first.rest, self.rest))))
 
@@ -138,7 +138,7 @@ def mean_now(state: LoadState) -> float:
 
 def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling: Sampling
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the mean of the lowest voltage of each course, its noise, its error, V; (k,)."""
+    """Return mean, noise and error of the lowest voltage of each course, V; shapes (k,)."""
     peak, dt = courses.peak, sampling.interval
     span = np.maximum(horizon, dt)
     stay = np.clip(courses.dwell, dt, span)
@@ -146,7 +146,7 @@ def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling:
     half = 0.5 * (stay - first)
     tau = np.stack([first, half, half, span - stay], axis=1)
     u = np.stack([peak, peak, peak, courses.rest], axis=1)
-    # Inrush and noise of a rise affect a median of three only if two samples are within the ramp.
+    # The inrush and noise of a rise affect a median of three only if two samples are in the ramp.
     up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE * min(
         max(_RAMP / dt - 1.0, 0.0), 1.0)
     inrush = np.zeros_like(u)
@@ -161,11 +161,11 @@ def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling:
     largest = np.interp(np.log(np.maximum(count, 1.0)), _LN_N, _MEAN)
     j = np.argmin(np.where(tau > 0.5 * dt, means - sd * largest, np.inf), axis=1)
     row, mean, sd, largest = rows[k, j], means[k, j], sd[k, j], largest[k, j]
-    # Samples of other groups count by how often they are as low as the lowest of group j.
+    # Samples of other groups count in proportion to how often they are as low as group j's lowest.
     apart = np.maximum(means - mean[:, None], 0.0) / sd[:, None]
     ln_n = np.log(np.maximum((count * np.exp(-largest[:, None] * apart)).sum(axis=1), 1.0))
     known = np.maximum(((row @ state.covariance) * row).sum(axis=1), 0.0)
-    # The throttle of a peak is evenly distributed within `AT_PEAK`, which counts as noise.
+    # The throttle of a peak is uniformly distributed within `AT_PEAK`, which counts as noise.
     c = state.size * state.mean
     slope = (c[2] + c[5:5 + len(LAGS)].sum()) * POWER * peak ** (POWER - 1.0) + (
         c[3] + c[5 + len(LAGS):-1].sum()) + 3.0 * c[4] * peak ** 2
@@ -175,12 +175,12 @@ def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling:
 
 # Length of a block, s; time that is kept, s; maximum silence that is filled, s.
 BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
-# Throttle within this distance of the highest counts as the peak.
+# Throttle within this distance of the highest throttle belongs to the peak.
 AT_PEAK = 0.05
 
 
 class FlightHistory:
-    """Past blocks; rows of `table`: lowest and last median of three, V; mean, highest throttle."""
+    """Past blocks; rows of `table`: lowest, last median of three, V; mean, highest throttle."""
 
     def __init__(self) -> None:
         self._clear()
@@ -189,19 +189,19 @@ class FlightHistory:
         self.table: FloatArray = np.empty((4, 0))
         self._start = NAN
         self._tail: FloatArray = np.empty(0)
-        # Samples of the last block.
+        # Number of samples in the last block.
         self._last = 0
 
     @property
     def end(self) -> float:
-        """Stamp at which the last complete block ends, s; NaN before any."""
+        """Stamp at which the last block ends, s; NaN without blocks."""
         return float(self._start + self.table.shape[1] * BLOCK)
 
     def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray) -> None:
         """Add samples with rising stamps, s, finite voltages, V, and throttles, 0..1."""
         pauses = np.flatnonzero(np.diff(t, prepend=self.end if self._tail.size else t[0]) > KEPT)
         if pauses.size:
-            # Earlier blocks are too old to be kept.
+            # Earlier blocks are too old to keep.
             self._clear()
             t, voltage, throttle = (x[pauses[-1]:] for x in (t, voltage, throttle))
         v = np.concatenate((self._tail, voltage))
@@ -221,10 +221,10 @@ class FlightHistory:
         self._place(at[begin], rows, count)
 
     def _place(self, at: np.ndarray, rows: FloatArray, count: np.ndarray) -> None:
-        """Put rows at their places; fill rows in between with the last one, or with NaN."""
+        """Put rows at their places; fill gaps with the last values, or with NaN if too long."""
         old = self.table.shape[1]
         if at[0] < old:
-            # Earlier samples have started this block.
+            # Combine the first row with earlier samples of its block.
             last = self.table[:, at[0]]
             rows[0, 0] = min(rows[0, 0], last[0])
             rows[3, 0] = max(rows[3, 0], last[3])
@@ -246,18 +246,18 @@ class FlightHistory:
         self.table = table
 
     def flown(self) -> tuple[float, float]:
-        """Return the lowest and the highest throttle; NaN without any."""
+        """Return the lowest and the highest throttle; NaN if none is known."""
         known = self.table[2:, np.isfinite(self.table[2])]
         return (float(known[0].min()), float(known[1].max())) if known.size else (NAN, NAN)
 
     def throttles(self, seconds: float, ago: float) -> FloatArray:
-        """Return the mean throttle of each block in `seconds` that ended `ago`, s, before now."""
+        """Return the mean throttle of each block in a span, s, that ended `ago` s before now."""
         end = self.table.shape[1] - round(ago / BLOCK)
         mean = self.table[2, max(0, end - round(seconds / BLOCK)):max(0, end)]
         return np.asarray(mean[np.isfinite(mean)])
 
     def used(self, seconds: float, share: float) -> float:
-        """Return the throttle exceeded for a share of the last seconds; NaN without any."""
+        """Return the throttle exceeded for a share of the last seconds; NaN if none is known."""
         high = self.table[3, -round(seconds / BLOCK):]
         high = high[np.isfinite(high)]
         return float(np.quantile(high, 1.0 - share)) if high.size else NAN
@@ -266,7 +266,7 @@ class FlightHistory:
         """Return the mean sqrt|du| between blocks in the last minute."""
         change = np.abs(np.diff(self.table[2, -round(60.0 / BLOCK):]))
         change = change[np.isfinite(change)]
-        # Round first, because the root of a rounding error is 1e-8.
+        # Round first, because the square root of a rounding error is 1e-8.
         return float(np.sqrt(np.round(change, 12)).mean()) if change.size else 0.0
 
     def outcome(self, t: float, horizon: float) -> tuple[float, float, float] | None:
@@ -283,7 +283,7 @@ class FlightHistory:
         return lowest, peak, max(at, 1) * BLOCK
 
     def drops(self, horizon: float) -> FloatArray:
-        """Return the drop below the start of each completed horizon (s), V; oldest first."""
+        """Return the fall to the lowest voltage in each completed horizon, V; oldest first."""
         width = max(1, round(horizon / BLOCK))
         low, last = self.table[0], self.table[1]
         if low.size <= width:
@@ -302,16 +302,17 @@ def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:
     return np.asarray(least(out[:out.size - rest], out[rest:]) if rest else out)
 
 
-# Horizons, s, and coefficients there of 1, margin less mean drop, and margin (logistic fit).
+# Logistic fit: horizons, s, and for each the coefficients of 1, of margin less mean drop, and of
+# margin.
 _LN_HORIZON = np.log([1.0, 2.0, 5.0])
 _COEFFICIENTS = np.array([(-0.90, -0.62, -0.34), (-0.52, -0.12, -0.68), (-1.08, 0.23, -0.52)])
-# Maximum margin of the fit, in standard deviations of the drops, and power with which the risk
-# falls beyond it.
+# Maximum margin of the fit, in standard deviations of the drops, and power of the margin with
+# which the risk falls beyond it.
 _FARTHEST, _POWER = 8.0, 5.0
-_RECENT = 5.0  # Time whose standard deviation gives the added drop, s
-# Minimum deviation as a share of the voltage, for a constant source.
+_RECENT = 5.0  # Time over which the standard deviation gives the added drop, s
+# Minimum deviation, as a share of the voltage; needed for a constant source.
 _LEAST = 1e-3
-# Minimum deviation at 0 V, V.
+# Minimum deviation, V; needed at 0 V.
 _SMALLEST = 1e-6
 # Minimum number of blocks: one second.
 _FEWEST = round(1.0 / BLOCK)
@@ -325,7 +326,7 @@ def excursions(past: FlightHistory, horizon: float) -> tuple[float, float]:
     recent = last[-round(_RECENT / BLOCK):]
     recent = recent[np.isfinite(recent)]
     drops = past.drops(horizon)
-    # Drops in overlapping horizons count as (number) x (block) / (horizon).
+    # Overlapping horizons count in part: by the ratio of block to horizon.
     n = drops.size * BLOCK / max(horizon, BLOCK)
     first = 2.0 * float(recent.std())
     least = max(_LEAST * abs(float(last[-1])), _SMALLEST)
@@ -338,7 +339,7 @@ def excursions(past: FlightHistory, horizon: float) -> tuple[float, float]:
 
 def excursion_risk(now: float, levels: FloatArray, horizon: float, mean: float, deviation: float
                    ) -> FloatArray:
-    """Return the risk at levels, V, shape (k,); it falls as the margin grows."""
+    """Return the risk at levels, V, shape (k,); the risk falls as the margin grows."""
     b = [float(np.interp(math.log(horizon), _LN_HORIZON, column)) for column in _COEFFICIENTS.T]
     margin = np.maximum(now - levels, 0.0) / deviation
     far = np.minimum(margin, _FARTHEST)
@@ -347,11 +348,11 @@ def excursion_risk(now: float, levels: FloatArray, horizon: float, mean: float, 
         1.0 + np.exp(-score)))
 
 
-# Scales of the weight of a past horizon: difference of throttle, and age, s.
+# Scales over which the weight of a past horizon falls: difference in throttle, and age, s.
 _LIKE, _MEMORY = 0.25, 100.0
 # Added rises, as shares of the range above the present throttle; their dwell, in horizons.
 _RISES, _RISE_DWELL = (0.1, 0.3, 0.5, 0.7, 0.9), 0.2
-# Minimum distance of starts, s and in horizons, and their maximum number.
+# Minimum distance between starts of horizons, in s and in horizons; maximum number of starts.
 _APART, _SHARE, _MOST = 0.2, 0.1, 320
 
 
@@ -367,7 +368,7 @@ class FlownHorizons:
 
 
 def flown(past: FlightHistory, horizon: float) -> FlownHorizons:
-    """Return throttle in completed horizons, s."""
+    """Return the throttle in completed horizons (horizon in s)."""
     width = max(1, round(horizon / BLOCK))
     mean, high = past.table[2], past.table[3]
     n = mean.size - width
@@ -384,13 +385,13 @@ def flown(past: FlightHistory, horizon: float) -> FlownHorizons:
     rest = np.where(count < width, (total - (within * near).sum(axis=1))
                     / np.maximum(width - count, 1), peak)
     good = np.isfinite(total + mean[at])
-    # At least one block, because the mean of the block that contains the peak may be below it.
+    # At least one block, because even the mean of the block with the peak may be below the peak.
     dwell = np.maximum(count, 1) * BLOCK
     return FlownHorizons(*(x[good] for x in (mean[at], peak, dwell, rest, (n - 1 - at) * BLOCK)))
 
 
 def pilot(past: FlownHorizons, throttle: float, horizon: float) -> tuple[Courses, FloatArray]:
-    """Return courses from a throttle on, and their weights, which add up to 1."""
+    """Return the courses that may follow a throttle, and their weights, which add up to 1."""
     weight = np.exp(-0.5 * ((past.first - throttle) / _LIKE) ** 2 - past.age / _MEMORY)
     if past.age.size > 1:
         weight *= min((past.age[0] - past.age[1]) / horizon, 1.0)

@@ -1,9 +1,9 @@
 """
 First-passage risk: the probability that the supply goes below a voltage within a horizon.
 
-Limits: throttle, alpha and sigma are assumed constant.  The risk is averaged over the errors of
-alpha, sigma, the level and the present voltage.  It refers to the continuous path, which acts on
-the hardware, not to its samples.
+The risk is averaged over the errors of alpha, sigma, the level and the present voltage.  It refers
+to the continuous path, which affects the hardware, not to samples.  Limits: throttle, alpha and
+sigma are assumed constant.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ou_monitor.model.passage import passage_probability
 from ou_monitor.records import Estimate, FloatArray, NAN
 
-# Number of quadrature nodes over the present voltage (for the other averages: `_MANY`, `_FEW`).
+# Number of quadrature nodes over the present voltage; `_MANY` and `_FEW` are for other averages.
 _START_NODES = 3
 
 
@@ -34,13 +34,13 @@ class Supply:
     # Logarithm of the intensity (V/sqrt(s)) and its standard error.
     ln_sigma: float
     ln_sigma_se: float
-    covariance: float = 0.0  # Of the errors of `ln_alpha` and `ln_sigma`.
+    covariance: float = 0.0  # Covariance of the errors of `ln_alpha` and `ln_sigma`.
 
     @classmethod
     def of(cls, e: Estimate) -> Supply:
         """Return the OU of an estimate; unknown errors count as zero."""
         alpha_se, sigma_se = _error(e.alpha_se), _error(e.sigma_se)
-        # From var_inf = sigma^2 / (2 alpha).
+        # The covariance follows from var_inf = sigma^2 / (2 alpha).
         both = 0.25 * (4.0 * sigma_se**2 + alpha_se**2 - _error(e.var_inf_se)**2)
         most = alpha_se * sigma_se
         u0_se = e.u0_se if math.isfinite(e.u0_se) else 0.0
@@ -56,21 +56,20 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
     Parameters
     ----------
     e : Estimate
-        The estimate; unless it is usable the risk is unknown.  The risk is
-        averaged over its standard errors.
+        The estimate.  The risk is averaged over its standard errors.
     voltage : float
         Brown-out level, V.
     horizon : float
         Time ahead, s, > 0.
     now : float, optional
-        Present voltage, V, a reading with noise of `e.noise_std`; the mean
-        level when left out.
+        Present voltage, V, a reading with noise of `e.noise_std`; by default,
+        the mean level.
 
     Returns
     -------
     float
-        Probability 0..1; 1 when the present voltage is at or below `voltage`;
-        else NaN when the estimate is not usable.
+        Probability, 0..1; 1 if the present voltage is at or below `voltage`;
+        otherwise NaN if the estimate is not usable.
 
     Raises
     ------
@@ -109,7 +108,7 @@ def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float |
 
 
 class _Paths:
-    """Start and parameters of the path at quadrature nodes, which cover their errors."""
+    """Start and parameters of the path at quadrature nodes over their errors."""
 
     def __init__(self, supply: Supply, now: float | None, noise_std: float, grid: FloatArray,
                  weights: FloatArray) -> None:
@@ -148,7 +147,7 @@ class Passage:
         return _Paths(self.supply, self.now, self.noise_std, *_FEW)
 
     def density(self, low: float, horizon: float) -> float:
-        """Return the density, 1/V, at a lowest voltage, smoothed over the noise."""
+        """Return the density, 1/V, at a lowest voltage, averaged over the width of the noise."""
         sd = math.exp(float(np.asarray(self.supply.ln_sigma)) - 0.5 * float(
             np.asarray(self.supply.ln_alpha))) / math.sqrt(2.0)
         half = max(self.noise_std, 0.1 * sd)
@@ -165,7 +164,7 @@ def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray
         np.asarray(value, dtype=np.float64)[..., None] for value in (
             supply.u0, supply.u0_se, supply.ln_alpha, supply.ln_alpha_se, supply.ln_sigma,
             supply.ln_sigma_se, supply.covariance))
-    # One axis is ln Var_inf = 2 ln sigma - ln alpha, another ln alpha given ln Var_inf.
+    # One axis is ln Var_inf = 2 ln sigma - ln alpha, another is ln alpha given ln Var_inf.
     variance = np.maximum(4.0 * ln_sigma_se**2 + ln_alpha_se**2 - 4.0 * covariance, 0.0)
     shared = np.divide(2.0 * covariance - ln_alpha_se**2, variance, out=np.zeros_like(variance),
                        where=variance > 0.0)
@@ -197,6 +196,6 @@ def _grid(*counts: int) -> tuple[FloatArray, FloatArray]:
             np.prod([axis.ravel() for axis in weights], axis=0))
 
 
-# Nodes over ln Var_inf, which matters most, over ln alpha given ln Var_inf, and over the level.
+# Nodes over ln Var_inf (which matters most), over ln alpha given ln Var_inf, and over the level.
 _MANY = _grid(7, 3, 3)
 _FEW = _grid(5, 1, 3)

@@ -2,13 +2,13 @@
 The brown-out flag: a level from risks and a voltage floor.
 
 doc/risk.md lists the levels, and when they are entered and left.  The flag is only as good as the
-risk; with an unknown risk the level is UNKNOWN, never OK, and the flag is never false.
+risk.  If the risk is unknown, the level is UNKNOWN, never OK, and the flag is never false.
 
 The voltage floor is a threshold on the samples, without a model.  It is compared with the median
 of the last `brownout.floor_time` seconds, so that a single wrong sample has no effect.  Every
-sample is checked, also between two reports.  A sample whose stamp is late, frozen, irregular or
-missing keeps its place by arrival; several that arrive together are spaced by the usual interval.
-The next update reports a dip, even if nothing has arrived since.  Limit: a wrong value that a
+sample is checked, also those between two reports.  A sample whose stamp is late, frozen, irregular
+or missing is placed by its arrival; samples that arrive together are spaced by the usual interval.
+The next update reports a dip even if nothing has arrived since.  Limit: a wrong value that a
 logger repeats for more than half of `brownout.floor_time` counts as a dip.
 """
 
@@ -24,25 +24,26 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import SLOW_MISSED
 from ou_monitor.records import FloatArray, NAN
 
-# Minimum number of samples for the median: three outvote a single wrong one.
+# Minimum number of samples for the median: among three, a single wrong one has no effect.
 _FEWEST = 3
-# If a whole batch is older than the newest sample by more than this, s, a new time line starts.
+# If a whole batch is older than the newest sample by more than this, s, a new time line begins.
 _BACK = 1.0
 # Number of arrivals over which the usual interval is averaged.
 _USUAL = 200
 # Maximum number of samples kept: the longest floor_time, 10 s, at 20 kHz.
 _MOST = 200_000
-# Maximum step forward, in `_longest_gap`: twice the span of three samples.  Without it, random
-# stamps would advance the time line until a float no longer resolves milliseconds.
+# Maximum step forward of the time line, in units of `_longest_gap`: twice the span of three
+# samples.  Without a limit, random stamps would advance the time line until a float no longer
+# resolves milliseconds.
 _FAR = 4.0
 
 
 class FloorWatch:
     """
-    Detects a voltage at or below the floor; `dips` counts its falls to the floor.
+    Detects a voltage at or below the floor; `dips` counts the falls to the floor.
 
-    Three samples that span more than twice `stale_after` are not combined in a median, except for
-    slow sources; `interval`: time between the samples of a slow source, s, else 0.
+    Three samples that span more than twice `stale_after` are not combined in a median, unless the
+    source is slow; `interval`: time between the samples of a slow source, s, otherwise 0.
     """
 
     def __init__(self, settings: MonitorSettings) -> None:
@@ -62,7 +63,7 @@ class FloorWatch:
         self._low = self._was_low = self._in_dip = False
 
     def new_time_line(self) -> None:
-        """Accept stamps that start anew; samples that came with an arrival time stay valid."""
+        """Accept stamps that start again; samples that came with arrival times remain valid."""
         if self._arrived == -math.inf:
             self.reset()
 
@@ -71,8 +72,8 @@ class FloorWatch:
         """
         Judge samples (t in s, voltage in V, arrival in s on a monotonic clock).
 
-        With `arrival` they are judged in the order given, and a stamp may be NaN; without, samples
-        of one batch that are newer than all before are put in order of their stamps.
+        With `arrival`, they are judged in the order given, and a stamp may be NaN.  Without it,
+        samples of a batch that are all newer than earlier samples are sorted by their stamps.
         """
         if self.settings.floor <= 0.0:
             if self._t.size:
@@ -91,7 +92,7 @@ class FloorWatch:
 
     def _placed(self, t: FloatArray, v: FloatArray, arrival: FloatArray | None
                 ) -> tuple[FloatArray, FloatArray]:
-        """Return times on a time line that never goes back, s, and the voltages at them, V."""
+        """Return times on a time line that never goes back, s, and voltages in that order, V."""
         if arrival is None:
             if t.max() < self._newest - _BACK:
                 self.reset()
@@ -99,7 +100,7 @@ class FloorWatch:
                 order = np.argsort(t, kind='stable')
                 t, v = t[order], v[order]
         steps = np.diff(t, prepend=self._newest)
-        # The comparison is false for NaN too, so a missing stamp counts as a late one.
+        # The comparison is false for NaN, so a missing stamp counts as a late stamp.
         late = ~(steps > 0.0)
         far = _FAR * self._longest_gap
         at = t + self._shift
@@ -126,13 +127,14 @@ class FloorWatch:
     def _late_steps(self, arrival: FloatArray | None) -> FloatArray | float:
         """Return the time by which late samples advance the time line, s."""
         if arrival is None or self._arrived == -math.inf:
-            # Unknown interval: assume half of `brownout.floor_time`, so two of three decide.
+            # If the interval is unknown, assume half of `brownout.floor_time`, so that three
+            # samples are compared.
             return (0.5 * self.settings.brownout_floor_time if math.isnan(self._usual)
                     else self._usual)
         return np.maximum(np.diff(arrival, prepend=self._arrived), 0.0)
 
     def _paced(self, elapsed: FloatArray, arrival: FloatArray | None) -> FloatArray:
-        """Return the time since the newest sample, s; space simultaneous samples as usual."""
+        """Return times since the newest sample, s; space simultaneous samples by the interval."""
         if arrival is None or math.isnan(self._usual):
             return elapsed
         least = self._usual * np.arange(1.0, elapsed.size + 1.0)
@@ -152,7 +154,7 @@ class FloorWatch:
         self._usual = usual + share * (interval - usual)
 
     def _judge(self, t: FloatArray, v: FloatArray) -> None:
-        """Judge every new sample with those before it; `t` does not decrease."""
+        """Judge every new sample together with earlier ones; `t` does not decrease."""
         s = self.settings
         old = self._t.size
         t, v = np.concatenate([self._t, t]), np.concatenate([self._v, v])
@@ -164,7 +166,7 @@ class FloorWatch:
         count = below[ends + 1] - below[begin]
         # The median is at or below the floor if more than half of the samples are.
         low = (count > 1) & (2 * count > ends + 1 - begin)
-        # A sample alone in the window neither starts nor ends a dip.
+        # A single sample in the window neither starts nor ends a dip.
         sure = low[ends > begin]
         self.dips += int(np.count_nonzero(sure & ~np.append(self._in_dip, sure)[:-1]))
         self._in_dip = bool(sure[-1]) if sure.size else self._in_dip
@@ -188,7 +190,7 @@ def _column(values: npt.ArrayLike) -> FloatArray:
 
 
 class FlagLevel(enum.Enum):
-    """Levels of the flag; the value orders the known ones."""
+    """Levels of the flag; the values order the levels."""
 
     UNKNOWN = -1
     OK = 0
@@ -201,10 +203,10 @@ class FlagState:
     """The flag at one instant."""
 
     level: FlagLevel = FlagLevel.UNKNOWN
-    # True at CRITICAL; False at OK and WARN when the risk is known; None when it is not.
+    # True at CRITICAL; False at OK and WARN if the risk is known; otherwise None.
     brownout: bool | None = None
     since: float = NAN  # When the level was entered, s, on the caller's clock
-    reason: str = 'nothing is known yet'  # Reason: a clause without a full stop
+    reason: str = 'nothing is known yet'  # A clause without a full stop
     age: float = NAN  # Time spent in the level, s
     low: bool = False  # Whether the voltage is at or below the floor, or was since the last update
     dips: int = 0  # Number of falls of the voltage to the floor so far
@@ -218,12 +220,13 @@ class BrownoutFlag:
         self._floor = FloorWatch(self._settings)
         self._now = self._last = NAN
         self._level = FlagLevel.UNKNOWN
-        # Times at which the level was entered, and at which risk or floor were last known.
+        # Time at which the level was entered; last time at which the risk was known or the voltage
+        # was at the floor.
         self._since = self._known = NAN
-        # Time since which the risk has always been at or above the entry value of a level.
+        # For each level, the time since which its condition has held.
         self._above: dict[FlagLevel, float] = {}
         self._state = FlagState()
-        # Why UNKNOWN is reported in place of OK and WARN; empty: it is not.
+        # Why UNKNOWN is reported in place of OK and WARN; empty: UNKNOWN is not forced.
         self._doubt = ''
 
     @property
@@ -247,11 +250,11 @@ class BrownoutFlag:
         self._floor.push(t, voltage, arrival)
 
     def new_time_line(self) -> None:
-        """Accept stamps that start anew; the level stays as long as it is held."""
+        """Accept stamps that start again; level and hold are kept."""
         self._floor.new_time_line()
 
     def clear(self) -> bool:
-        """Clear a CRITICAL that is latched or held; the next update decides again."""
+        """Clear a CRITICAL that is latched or held; the next update judges again."""
         if self._level is not FlagLevel.CRITICAL:
             return False
         self._enter(FlagLevel.UNKNOWN)
@@ -261,7 +264,7 @@ class BrownoutFlag:
         return True
 
     def set_critical(self, reason: str) -> None:
-        """Set CRITICAL for an external reason: a latch restored after a restart."""
+        """Set CRITICAL, for a latch that is restored after a restart."""
         self._enter(FlagLevel.CRITICAL)
         self._state = FlagState(FlagLevel.CRITICAL, True, self._since, reason)
 
@@ -275,9 +278,9 @@ class BrownoutFlag:
         Judge the level (t in s).
 
         `risk`: within the horizon; `soon`: within the next second at the present throttle (omitted
-        or NaN: as `risk`).  `tight`: the budget is below the throttle in use.  `fresh`: the
-        samples behind the risk are not too old.  `arriving` (default: `fresh`): samples still
-        arrive, whatever their stamps, so a last one at the floor still counts.
+        or NaN: as `risk`).  `tight`: whether the budget is below the throttle in use.  `fresh`:
+        whether the samples behind the risk are recent.  `arriving` (default: `fresh`): whether
+        samples still arrive, whatever their stamps; then a last sample at the floor still counts.
         """
         soon = risk if soon is None or math.isnan(soon) else soon
         for one in (risk, soon):
@@ -323,7 +326,7 @@ class BrownoutFlag:
 
     def _wanted(self, risk: float, soon: float, tight: bool, known: bool, low: bool
                 ) -> tuple[FlagLevel, str]:
-        """Return the level that follows from risks and floor, before hold and latch."""
+        """Return the level by risks and floor, before hold and latch, and the reason."""
         s = self._settings
         asks = {FlagLevel.CRITICAL: (soon, s.brownout_critical, f'risk {soon:.2g} within 1 s, '
                                      'at the present throttle'),
@@ -348,13 +351,13 @@ class BrownoutFlag:
                 return level, (f'{words}, has not fallen below {leave:.2g} '
                                f'(brownout.leave x brownout.{word})')
         if above:
-            # The level is UNKNOWN or OK: a higher one would have been returned.
+            # The present level is below the one that waits, which was not returned above.
             return self._level, (f'risk {max(risk, soon):.2g} waits for brownout.delay '
                                  f'({s.brownout_delay:g} s)')
         return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'
 
     def _is_delayed(self, level: FlagLevel) -> bool:
-        """Whether a level that is not entered yet has to wait for `brownout.delay`."""
+        """Whether a level above the present one still has to wait for `brownout.delay`."""
         return (self._level.value < level.value
                 and self._now - self._above[level] < self._settings.brownout_delay)
 

@@ -3,23 +3,24 @@ Brown-out risk by the method that predicts this flight best, and the risk if thr
 
 Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
-used alone if the load is unknown).  First passage and the other method are averaged, weighted by
-the share of completed horizons whose lowest voltage contradicts first passage.
+used alone if the load is unknown).  First passage is averaged with one of the other methods; the
+other method's weight is the share of completed horizons whose lowest voltage contradicts first
+passage.
 
 Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu - start) + e, with
 mean mu, noise s and error r of `lowest`, by least squares with forgetting; e has Student's t
 distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2 + k2 r^2.
 
-Each law is mixed with a wider one, whose weight is the share of horizons that contradict the law
-(rule of succession).  A horizon counts with the probability that the law was wrong in it, and with
-step / horizon where horizons overlap.  For first passage the other method takes the place of the
-wider law.  For a given throttle the wider law has the width of the excursions, but at most
-`_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
-irrelevant to idling.  It grows if the contradicting voltages lie farther below the mean of the law
-than this width.
+Each law is mixed with a wider law, whose weight is the share of horizons that contradict the law
+(rule of succession).  A horizon counts with the probability that the law was wrong in it, and if
+horizons overlap, with step / horizon.  For first passage, the other method takes the place of the
+wider law.  For a given throttle, the wider law initially has the width of the excursions, but at
+most `_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
+irrelevant to idling.  The width grows if the contradicting voltages are farther below the mean of
+the law.
 
-Limits, in addition to doc/risk.md: all throttles share one bias and one gain; values between two
-horizons are interpolated.
+Limits, in addition to doc/risk.md: one bias and one gain apply to all throttles; values between
+two horizons are interpolated.
 
 `look_ahead` computes the risk, its curve over throttle, and the throttle budget for the present
 settings.
@@ -54,18 +55,18 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
 # Prior of the law: weight of the variances, in horizons; k0 (1 to 6 on nine recorded flights, from
-# gecko to cf_takeoff), k1 (0.015 to 0.09 on these), and k2 (1: the load filter's stated error is
-# right); precision matrix of bias and gain (elements 00, 01, 11).
+# gecko to cf_takeoff), k1 (0.015 to 0.09 on these flights) and k2 (1: the error stated by the load
+# filter is right); precision matrix of bias and gain (elements 00, 01, 11).
 _PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03, 1.0])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
-# Memory, s; limit of squared standardised errors; standardised error beyond which errors weigh
-# less in the regression.
+# Memory, s; limit of squared standardised errors; standardised error above which errors weigh less
+# in the regression.
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Maximum initial width of the wider law, in widths of the law: chosen on gecko, nazgul, roma,
 # bf3s, erle and cf_solo (2 to 6 tried).
 _WIDEST = 4.0
-# Weight of the initial width, in horizons, when it is averaged with the misses of this flight
-# (chosen on gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
+# Weight of the initial width in its average with the misses of this flight, in horizons (chosen on
+# gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
 _FIRST = 4.0
 # Number of horizons that initially count as agreeing with the law for a given throttle: chosen on
 # the recordings of `_WIDEST`, hiro, cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9, 19 tried).
@@ -82,7 +83,7 @@ def density(x: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArra
 def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return P(x < level) for the same Student's t, elementwise."""
     t = (level - mean) / deviation * math.sqrt(FREEDOM / (FREEDOM - 2.0))
-    # Abramowitz & Stegun 26.7.4; its terms cancel in the far tail, where the series is used.
+    # Abramowitz & Stegun 26.7.4; in the far tail, where its terms cancel, the series is used.
     angle = np.arctan2(math.sqrt(FREEDOM), np.abs(t))
     c = np.sin(angle)
     tail = (angle - np.cos(angle) * c * (1.0 + 2.0 / 3.0 * c * c)) / math.pi
@@ -162,7 +163,7 @@ class Calibrator:
 
 
 class ContradictionRate:
-    """Share of horizons that contradict a law; initially `right` horizons count as agreeing."""
+    """Share of horizons that contradict a law; initially, `right` horizons count as agreeing."""
 
     def __init__(self, right: float) -> None:
         self._right, self._wrong = right, 1.0
@@ -176,7 +177,7 @@ class ContradictionRate:
 
     @property
     def misses(self) -> tuple[float, float]:
-        """Return number and sum of squares, V^2, of the misses that contradict."""
+        """Return number and sum of squares, V^2, of the misses that contradict the law."""
         return self._wrong - 1.0, self._squares
 
     def add(self, law: float, far: float, weight: float, elapsed: float, miss: float = 0.0
@@ -191,24 +192,24 @@ class ContradictionRate:
         self._right = self._first + (self._right - self._first) * keep + weight * (1.0 - wrong)
 
 
-# Horizons, s, for which laws are learned; those between are interpolated in ln h.
+# Horizons, s, for which laws are learned; laws between two horizons are interpolated in ln h.
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_HORIZONS = np.log(HORIZONS)
-# Share in the interpolation below which a horizon is left out, above rounding errors.
+# Share in the interpolation below which a horizon is left out; larger than rounding errors.
 _LEAST_SHARE = 1e-9
 # Time between updates, s, and as a share of the horizon.
 LOOK, _LOOK_SHARE = 0.2, 0.2
-# Minimum time between updates by arrival, s: stamps may run a thousand times too fast, and an
-# update takes 1 ms.  A replay at four times the speed is not affected.
+# Minimum time between updates by arrival, s: an update takes 1 ms, and stamps may run a thousand
+# times too fast.  A replay at four times the speed is not affected.
 _REST = 0.05
-# Limit of the error of ln sigma; with a larger one, sigma is practically unknown.
+# Limit of the error of ln sigma; with a larger error, sigma is practically unknown.
 _LARGEST_ERROR = 1.0
-# Number of horizons that initially count as agreeing with first passage; one counts as
-# contradicting it.  It is large, because first passage is used only if the window is an OU.
+# Number of horizons that initially count as agreeing with first passage (one counts as
+# contradicting it); large, because first passage is used only if the window shows an OU.
 _PREDICTED = 9.0
-# Share of the excursions in the method `load`, because the pilot's next throttle is unknown.
-# Half: the errors of the two forecasts differ, and no flight is long enough to learn weights (on
-# ten flights of seven quadcopters, weights learned in flight were worse).
+# Share of the excursions in the method `load`, because the pilot's next throttle is unknown.  The
+# errors of the two forecasts differ, and no flight is long enough to learn weights (on ten flights
+# of seven quadcopters, weights learned in flight were worse).
 _HALF = 0.5
 # Time over which the throttle in use is determined, s.
 _USED = 30.0
@@ -228,7 +229,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class _PendingHorizon:
-    """State at the beginning of a horizon (mean, deviation: of drops), kept until it is over."""
+    """State at the beginning of a horizon, kept until its end (mean, deviation: of drops)."""
 
     t: float
     voltage: float
@@ -251,7 +252,7 @@ class _HorizonLaws:
 
     @property
     def values(self) -> FloatArray:
-        """Return all values that are interpolated between horizons."""
+        """Return the values that are interpolated between horizons."""
         return np.append(self.calibrator.law.values, (
             self.held.value, *self.held.misses, self.passage.value))
 
@@ -304,7 +305,7 @@ class Forecast:
     """
 
     def __init__(self, loads: LoadFilter, look: float = LOOK, horizon: float = NAN) -> None:
-        # This takes a third of a second once, so it is done before the first sample.
+        # The first call takes a third of a second, so make it before the first sample.
         prepare()
         self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
@@ -369,7 +370,7 @@ class Forecast:
 
     @property
     def flown(self) -> tuple[float, float]:
-        """Return the lowest and the highest throttle of the last minutes; NaN without any."""
+        """Return the lowest and the highest throttle of the last minutes; NaN if unknown."""
         return self._past.flown()
 
     @property
@@ -380,16 +381,16 @@ class Forecast:
 
     @property
     def used(self) -> float:
-        """Return the throttle exceeded for a tenth of the last 30 s; NaN without any."""
+        """Return the throttle exceeded for a tenth of the last 30 s; NaN if unknown."""
         return self._past.used(_USED, 0.1)
 
     @property
     def voltage(self) -> float:
-        """Present voltage, V: the median of the last three samples; NaN with a single one."""
+        """Present voltage, V: the median of the last three samples; NaN for a single sample."""
         return median(self._last.tolist()) if self._last.size > 1 else NAN
 
     def follow(self, e: Estimate, window: float, ago: float = 0.0) -> None:
-        """Take the newest estimate, of a window, s, that ended some time ago, s."""
+        """Take the newest estimate, and the length of its window, s, which ended `ago` s ago."""
         self.estimate, self._window = e, (window, ago)
 
     def supply(self) -> Supply | None:
@@ -399,8 +400,8 @@ class Forecast:
         plain, state = Supply.of(self.estimate), self._loads.state()
         if state is None:
             return plain
-        # sigma averages over the throttles of the window; the load model scales it to the present
-        # throttle.
+        # sigma is an average over the throttles of the window; the load model scales it to the
+        # present throttle.
         flown = np.clip(np.append(self._past.throttles(*self._window), state.throttle),
                         *state.flown)
         apart = ripple(flown) - ripple(flown[-1])
@@ -456,7 +457,7 @@ class Forecast:
         return self._kept_flown[horizon]
 
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float]:
-        """Return the law, its contradictions (3 values), and those of first passage."""
+        """Return the law, share and misses (two values) of its contradictions, passage's share."""
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
@@ -498,7 +499,7 @@ class Forecast:
 
     def risks_held(self, throttle: FloatArray, voltage: float, *horizons: float
                    ) -> list[FloatArray]:
-        """Return the risk within each horizon of throttles held for it, (k,), as `risk_if`."""
+        """Return, for each horizon, the risk of throttles held throughout, (k,); see `risk_if`."""
         every = sorted({one for horizon in horizons for one in _shorter_horizons(horizon)})
         state = self._state()
         risks = dict(zip(every, self._risks_if(state, throttle, math.inf, voltage, every)))
@@ -508,7 +509,7 @@ class Forecast:
     def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float,
                 sag: float = 1.0, noise: float = 1.0) -> FloatArray:
         """Return the risk, (k,), of each throttle held for `dwell`, s; NaN: load unknown."""
-        # With the response to throttle times `sag`, and the variance of the noise times `noise`.
+        # sag, noise: factors on the response to throttle, and on the variance of the noise.
         u = np.clip(np.atleast_1d(np.asarray(throttle, dtype=np.float64)), 0.0, 1.0)
         state = self._state()
         if state is not None and (sag, noise) != (1.0, 1.0):
@@ -516,7 +517,8 @@ class Forecast:
             state = replace(state, mean=scale * state.mean,
                             covariance=np.outer(scale, scale) * state.covariance,
                             deviation=tuple(math.sqrt(noise) * x for x in state.deviation))
-        # A fall within a shorter horizon is also within this one; shorter ones have more data.
+        # A fall within a shorter horizon is also within this one, and shorter horizons have more
+        # data.
         return np.asarray(np.max(self._risks_if(
             state, u, dwell, voltage, _shorter_horizons(horizon)), axis=0))
 
@@ -574,7 +576,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
     outcome = forecast.risk(voltage, horizon)
     if alone:
         return RiskOutlook(outcome)
-    # One call for both is twice as fast as two.
+    # One call for both horizons is twice as fast as two calls.
     each = forecast.risks_held(np.append(_GRID, forecast.throttle), voltage, SOON, horizon)
     soon, risks = each[0].item(-1), _rising(each[1][:-1])
     if math.isnan(soon):
@@ -596,12 +598,12 @@ def risk_over_throttle(forecast: Forecast, voltage: float, horizon: float, sag: 
 
 
 def _rising(risks: FloatArray) -> FloatArray:
-    # Less throttle is never riskier; the law may predict otherwise just after high throttle.
+    # Less throttle is never riskier, but just after high throttle the law may predict otherwise.
     return np.asarray(np.minimum.accumulate(risks[::-1])[::-1])
 
 
 def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:
-    """Return the highest throttle whose risk is under a limit (0: none), and why; risks: (51,)."""
+    """Return the highest throttle with a risk within a limit (0: none), and why; risks: (51,)."""
     # The budget ends at the first throttle above the limit, even if the risk falls again beyond.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))
@@ -610,7 +612,7 @@ def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[fl
     end = 1.0
     if within < _GRID.size:
         low, high = risks[within - 1], risks[within]
-        # Interpolate the logarithm of the risk, which is nearly straight over this distance.
+        # Interpolate the logarithm of the risk, which is nearly linear over this distance.
         end = float(_GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
             math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0))
     if end <= highest:
