@@ -304,7 +304,7 @@ class ClockJitter(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a starting point for errors that show on the slopes of lines."""
+        """Return a starting point for errors that are visible on the slopes of pure lines."""
         square = np.square(np.broadcast_to(view.slope, view.z.shape)[view.train])
         usual = float(square.mean())
         if not float(square.std()) > 0.0:
@@ -359,13 +359,13 @@ class ClockJitter(Term):
 
 @dataclass(frozen=True)
 class JitterOnLines(ClockJitter):
-    """The same errors where lines show them: as white noise in proportion to their slopes."""
+    """The same errors on the slopes of pure lines: white noise in proportion to the slope."""
 
     ROLE: ClassVar[Role] = Role.NOISE
     FREE: ClassVar[tuple[str, ...]] = ('std',)
 
     def holds(self, view: View) -> bool:
-        """Return whether samples keep their order, so that the errors are of the stamps."""
+        """Return whether the errors are too small to change the order of the samples."""
         return self.std * view.rate < _MOST_ERROR
 
     def variances(self, s: Segment) -> FloatArray:
@@ -373,8 +373,8 @@ class JitterOnLines(ClockJitter):
         return np.square(self.std * s.slope)
 
 
-# Maximum standard deviation of the errors of stamps, in steps; minimum score, standard errors, of
-# a fit of errors on lines: half of its square is 6 nats, as evidence needs.
+# Maximum standard deviation of the errors of stamps, in steps; minimum score, in standard errors,
+# for a fit of errors on lines (half of its square is 6 nats, the evidence that a cause needs).
 _MOST_ERROR, _STEEPER = 0.45, 3.5
 
 
