@@ -13,7 +13,7 @@ exact for the barrier b = 0; R is smooth and vanishes at w = 0, at b = 0 and
 for s -> 0.  With lambda = ln(exp(2 s) - 1) / 2, y = w exp(-s) and
 g = exp(-s) phi(y) / Phi(-y), the backward equation P_s = P_xx - x P_x becomes
 
-    R_lambda = R_ww + R_w^2 + (w (1 - 2 T) + b sqrt(T) - 2 g) R_w - b sqrt(T) g,
+    R_lambda = R_ww + R_w^2 + (w (1 - 2 T) + b sqrt(T) - 2 g) R_w - b sqrt(T) g.
 
 It is solved once for all barriers by linearly implicit steps (BDF2), and R is
 interpolated in a table by cubic splines.  Because R is a logarithm, the relative

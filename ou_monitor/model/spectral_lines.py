@@ -115,7 +115,7 @@ class EvenGrid:
     """Samples on an evenly spaced grid, with missing ones interpolated."""
 
     values: FloatArray  # Samples
-    where: npt.NDArray[np.intp]  # Indices of those that were given
+    where: npt.NDArray[np.intp]  # Grid indices of the samples that were given
     rate: float  # Samples per second, Hz
 
 

@@ -159,7 +159,7 @@ class MonitorNode(Node):
         super().destroy_node()
 
     def values(self) -> dict[str, Any]:
-        """Return the parameters in force."""
+        """Return the present parameters."""
         return {name: self.get_parameter(name).value for name in self._changeable | self._fixed}
 
     def check(self, values: Mapping[str, Any]) -> None:

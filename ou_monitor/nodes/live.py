@@ -135,7 +135,7 @@ def application(node: Any, token: str) -> Any:
                 raise HTTPError(403)
 
         def set_default_headers(self) -> None:
-            """Forbid the browser to load anything but the page itself."""
+            """Allow the browser to load nothing but the page itself."""
             self.set_header('Content-Security-Policy', policy)
             self.set_header('X-Content-Type-Options', 'nosniff')
             self.set_header('Referrer-Policy', 'no-referrer')

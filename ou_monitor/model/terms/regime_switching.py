@@ -369,7 +369,7 @@ class RegimeSwitching(Term):
 
     rate_up: float = parameter('1/s', 'rate of switching to each higher state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of switching to each lower state', 0.0, above=True)
-    level: float = parameter('V', 'voltage of a state less that of the state below')
+    level: float = parameter('V', 'difference in voltage from the state below')
     sigma_ratio: float = parameter('', 'ratio of sigma to sigma in the state below', 0.0)
     at_once: float = parameter(
         '', 'share of the level that acts at once; the rest relaxes at alpha', 0.0, 1.0)

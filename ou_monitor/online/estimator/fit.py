@@ -273,7 +273,7 @@ def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
     """Return log-determinant, solutions, and two diagonals of the inverse (cyclic reduction)."""
     halves, pivots = [], []
     while diag.size > _DENSE:
-        # Each odd row has a row before it and, except for the last row of all, one after it.
+        # Each odd row has a row before it and, unless it is the last row, a row after it.
         pivot, before, after, w = diag[1::2], off[0::2], off[1::2], right[:, 1::2]
         m, k = pivot.size, after.size
         inverse = 1.0 / pivot

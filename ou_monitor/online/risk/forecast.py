@@ -335,7 +335,7 @@ class Forecast:
             laws.next = laws.learned = -math.inf
 
     def take(self, batch: Batch, came: float = math.inf) -> None:
-        """Take readings; came: arrival of the last, s, on a monotonic clock; inf: unknown."""
+        """Take readings; came: arrival of the last one, s, by a monotonic clock; inf: unknown."""
         t, v, u, drawn = batch.columns
         if t[0] < self._newest:
             # Stamps increase within one time line, so another one has begun.
