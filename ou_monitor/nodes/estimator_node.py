@@ -180,12 +180,11 @@ class EstimatorNode(MonitorNode):
     # -- messages in
 
     def _poll(self, most: float = 0.0) -> None:
-        """Fetch messages; pass them to the monitor if the last transfer was `most` s ago."""
+        """Fetch messages; pass them on if the last transfer was at least `most` s ago."""
         for each in self._inputs.values():
             each.fetch()
         now = self.steady_now()
-        # On simulated time there is no delay, because a message counts as received when it is
-        # read.
+        # On simulated time, transfer at once, because a message counts as received when read.
         if now - self._handed_over < most and not self._stamper.simulated and not any(
                 each.full for each in self._inputs.values()):
             return

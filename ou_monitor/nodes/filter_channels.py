@@ -1,8 +1,8 @@
 """
 The signals that `adaptive_filter` takes from a message and writes back.
 
-A derivative has another unit than its signal (per second), so it is not written into the field of
-the signal, but published in a message of another type.
+The unit of a derivative differs from its signal's (per second), so a derivative is not written
+into the field of the signal, but published in a message of another type.
 """
 
 from __future__ import annotations

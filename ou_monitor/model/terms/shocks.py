@@ -329,7 +329,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """Make the noise of each step Student-t with unchanged variance; dof is for this spacing."""
+    """Make each step's noise Student-t with equal variance; dof is valid for one step length."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'
