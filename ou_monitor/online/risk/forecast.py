@@ -16,8 +16,8 @@ Each law is mixed with a wider law, whose weight is the share of horizons that c
 horizons overlap, with step / horizon.  For first passage, the other method takes the place of the
 wider law.  For a given throttle, the wider law initially has the width of the excursions, but at
 most `_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
-irrelevant to idling.  The width grows if the contradicting voltages are farther below the mean of
-the law.
+irrelevant to idling.  This width grows if the contradicting voltages are farther than the width
+below the mean of the law.
 
 Limits, in addition to doc/risk.md: one bias and one gain apply to all throttles; values between
 two horizons are interpolated.
