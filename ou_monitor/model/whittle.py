@@ -92,8 +92,8 @@ _ONE_BY_ONE, _WIDTH = 24, 0.06
 def cosines(x: FloatArray) -> FloatArray:
     """Return the orthonormal cosine transform (DCT-II) of rows, shape (q, n)."""
     n = x.shape[1]
-    # By one Fourier transform of the even samples followed by the reversed odd ones: Makhoul, IEEE
-    # Trans. Acoust. Speech Signal Process. 28 (1980) 27.
+    # Computed by one Fourier transform of the even samples followed by the reversed odd samples
+    # (Makhoul, IEEE Trans. Acoust. Speech Signal Process. 28 (1980) 27).
     F = np.fft.rfft(np.concatenate([x[:, ::2], x[:, 1::2][:, ::-1]], axis=1), axis=1)
     F *= np.exp(-0.5j * np.pi / n * np.arange(F.shape[1])) * math.sqrt(2.0 / n)
     F[:, 0] *= math.sqrt(0.5)

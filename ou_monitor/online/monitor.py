@@ -443,7 +443,7 @@ class SupplyMonitor:
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
 
     def changed_risk(self, sag: float, noise: float, voltage: float) -> FloatArray:
-        """Return the risks over throttle, (51,), if sag and noise variance change by factors."""
+        """Return the risks over throttle, (51,), with sag and noise variance times factors."""
         level, ahead = self._checked(voltage, None)
         return risk_over_throttle(self._forecast, level, ahead, sag, noise)
 

@@ -24,8 +24,8 @@ the candidate does not have less noise with each low-pass.
 Limits: only lines that follow the motors are removed, and motor speeds or throttle are needed.
 The law does not resolve the speeds of single motors.  Lines above half the sample rate are not
 followed, because their aliases fall as throttle rises.  A change of the vehicle is learned in half
-a minute.  A frame with a gap of more than five intervals is dropped; with less uneven stamps, it
-is interpolated.
+a minute.  Frames with a gap of more than five intervals are dropped; frames with less uneven
+stamps are resampled.
 
 **Filters**: state-variable filters whose coefficients may change.  With w = 2 pi f and
 k = bandwidth / f, one notch of depth m is

@@ -157,7 +157,7 @@ class LoadDelay:
         self._pieces, self._sum, self._squares = 0.0, none, none
 
     def take(self, t: float, v: float, x: float) -> bool:
-        """Take time, s, voltage, V, and load of a block as received; return if delay changed."""
+        """Take a block (t in s, v in V, x: load as received); return whether delay changed."""
         dt = t - self._t
         if not 0.0 < dt <= _LONGEST:
             self.forget()

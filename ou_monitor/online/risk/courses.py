@@ -37,8 +37,8 @@ from ou_monitor.records import FloatArray, NAN
 
 # Duration of the first group after a rise, in time constants of the inrush.
 _RISE = 2.0
-# Duration of a rise, which is a ramp, s; so the inrush of a step is multiplied by its time
-# constant over this duration.
+# Duration of a rise, s.  A rise is a ramp, so its inrush is smaller than a step's by the factor
+# time constant / duration.
 _RAMP = 0.2
 _SHARE_OF_RISE = INRUSH_TIME / _RAMP
 
