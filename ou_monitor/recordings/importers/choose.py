@@ -168,8 +168,6 @@ def _current(log: Log, voltage: Series) -> Series | None:
 def _no_voltage(path: Path, log: Log, option: str) -> str:
     others = _series_of(log, VOLTAGE) + _series_of(log, ANY)
     why = ''.join(f' ({note})' for note in log.notes)
-    if log.format == 'csv':
-        return (f"{path}: no column 'voltage_v': name one with --voltage, {_LIST}")
     if others:
         return (f'{path} has no battery voltage; choose another with {option.format(VOLTAGE)} '
                 f'NAME: {_names_of(others)}{why}')

@@ -71,10 +71,9 @@ _OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?[^",\d]*"')
 # A number that shows that the decimal mark is a point.
 _OF_PLAIN = re.compile(r'(?:^|,)[-+]?\d+\.(?!\d{3}(?!\d))\d+(?=,|$)', re.MULTILINE)
 # A number with both marks shows which of them separates thousands.
-_BOTH_MARKS = {'.': r'(?<![\d.,:])\d{1,3}(?:,\d{3})+\.\d+(?![\d.,:])',
-               ',': r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+,\d+(?![\d.,:])'}
-# A blank between thousands, as spreadsheets write it, which does not separate cells.
-_BLANK = re.compile('(?<=\\d)[\xa0\u2007\u2009\u202f](?=\\d{3}(?!\\d))')
+_BOTH_MARKS = {'.': r'\d{1,3}(?:,\d{3})+\.\d+', ',': r'\d{1,3}(?:\.\d{3})+,\d+'}
+# A blank or ' between thousands, as spreadsheets write it, which does not separate cells.
+_BLANK = re.compile("(?<=\\d)[\xa0\u2007\u2009\u202f'\u2019](?=\\d{3}(?!\\d))")
 # A number whose decimal comma is within quotes, and does not separate thousands.
 _QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
 # Lines above the data that state the time between rows, or its inverse.
@@ -140,13 +139,15 @@ def form_of(path: Path, wanted: CsvColumns, *, header: bool = False) -> Form:
                          "cells, 'tab' or 'space'")
     best: tuple[float, Form] | None = None
     for delimiter in (',', ';', '\t', '|', ' ') if given is None else (given,):
-        known = wanted.decimal or next((mark for mark, both in _BOTH_MARKS.items() if re.search(
-            f'"[-+]?{both}[^",]*"' if delimiter == ',' else both, text)), '')
-        if not known and delimiter == ',' and _OF_QUOTED.search(text) and _OF_PLAIN.search(text):
-            known = '.'
-        if not known and delimiter == ',' and _names_half(_split(lines, ',', False, '')):
-            known = ','
-        for mark in known or '.,':
+        known = wanted.decimal or ''
+        if not known and delimiter == ',':
+            known = next((mark for mark, both in _BOTH_MARKS.items() if re.search(
+                f'"[-+]?{both}[^",]*"', text)), '') or '.' * bool(
+                    _OF_QUOTED.search(text) and _OF_PLAIN.search(text)) or ',' * bool(
+                        _names_half(_split(lines, ',', False, '')))
+        # Where commas do not separate cells, the other mark may separate thousands.
+        for mark, known in [(mark, known) for mark in known or '.,'] + [
+                (mark, mark) for mark in ',.' if not known and delimiter != ',']:
             if mark == delimiter and not (known or _QUOTED.search(text)) or (
                     best and delimiter == ' ' and best[1].width > 1):
                 continue
@@ -343,8 +344,8 @@ def _numbering(rows: list[list[str]]) -> int:
 
 def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
     """Return lines with decimal points, without comments, and with single blanks as delimiters."""
-    lines = ['\n' if line.lstrip().startswith(COMMENTS) else
-             line if line.isascii() else _BLANK.sub('', line) for line in lines]
+    lines = ['\n' if line.lstrip().startswith(COMMENTS) else line
+             if line.isascii() and "'" not in line else _BLANK.sub('', line) for line in lines]
     if lines and _RECEIVED.match(lines[0]):
         lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
             delimiter in (rest := line[found.end():]).strip() or ' ' not in rest.strip())

@@ -24,12 +24,12 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
     AMPERE_WORDS, CHANNEL, clock_times, factor_of, has_day, is_clock, is_missing, is_number,
-    is_value, number_of, OTHER_WORDS, SHARE_WORDS, shown, TIME_WORDS, unit_of, unit_word,
+    is_value, number_of, OTHER_WORDS, SCALES, SHARE_WORDS, shown, TIME_WORDS, unit_of, unit_word,
     VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.csv_units import (
-    FileColumn, in_si, PULSE_WORDS, spread, stamps_of, unwrapped)
+    FileColumn, in_si, lower_rows, PULSE_WORDS, spread, stamps_of, unwrapped)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -43,6 +43,8 @@ NONE = 'none'
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
 _BACK = 0.25
+# Maximum number of series that whole numbers name: MAVLink has up to nine batteries.
+_MOST_SERIES = 9
 # Minimum number of rows for conclusions from comparing rows, such as repeated stamps.
 _FEW_ROWS = 8
 
@@ -51,6 +53,10 @@ _FEW_ROWS = 8
 # lower case, with '_' for other characters. From the exports named in test_csv_exports.py.
 _VALUE_NAME = r'_?(?:values?|reading|data|ampl(?:itude)?|wert|messwert)?'
 _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
+# Words in names of columns that are not the supply's voltage.
+_OTHERS = 'axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag'
+# Names that are a voltage only if no other column may be one.
+_SUPPLY_NAME = '(?:[uv]_?)?(?:akku|batt?|pack|supply|rail)|vol|spg'
 _PATTERNS = {
     _TIME_NAME: (
         r'time_s',
@@ -67,8 +73,7 @@ _PATTERNS = {
         r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?|[uv]_1_[uv](?:rms|dc|mean|mn)',
         r'volt(?:age)?_?filtered(?:_v)?|rxbt',
-        r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
-        r'spannung|vbat).*'),
+        rf'(?!.*(?:{_OTHERS})).*(?:volt|spannung|vbat).*'),
     logs.THROTTLE: (
         r'throttle|(?:.*_)?actuator_motors(?:_\d+)?_control_0+',
         r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|(?:commande_)?ga[sz]|'
@@ -114,15 +119,15 @@ class _Table(NamedTuple):
     t: FloatArray
     found: dict[str, tuple[FileColumn, FloatArray]]  # By quantity
     named: dict[str, FloatArray]  # Other requested columns, as written
-    note: str  # How the file was read; '' if nothing was detected
+    notes: list[str]  # How the file was read, if anything was detected; rows left out
 
 
 def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = False,
              ) -> RawColumns:
     """Read the samples of a supply, unsorted, with NaN kept (partial: leave out bad lines)."""
     left_out: list[str] | None = [] if partial else None
-    table = _table(path, columns or CsvColumns(), needed=True, left_out=left_out)
-    said = [table.note] if table.note else []
+    table = _table(path, columns or CsvColumns(), left_out=left_out)
+    said = [*table.notes]
     if left_out:
         if len(left_out) > WILD * table.t.size:
             raise InputError(f'{left_out[0]} ({len(left_out)} such lines, too many to leave out)')
@@ -160,7 +165,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
 
 def read(path: Path, request: Request) -> Log:
     """Read the columns of a supply, and the requested ones."""
-    table = _table(path, request.columns or CsvColumns(), more=request.names)
+    table = _table(path, request.columns or CsvColumns(), more=request.names, needed=(
+        '' if request.names or request.everything else ' (--voltage, see convert LOG --list)'))
     header, t = [name for name in table.form.names if name], table.t
     if not t.size:
         raise InputError(f'{path} holds a header and no line below it')
@@ -171,7 +177,7 @@ def read(path: Path, request: Request) -> Log:
              if name not in request.names and not np.isfinite(values).any()}
     series += [Series(name, ANY, t, values, '1', 'column')
                for name, values in table.named.items() if name not in {*taken, *words}]
-    notes: list[str] = [table.note] if table.note else []
+    notes = [*table.notes]
     notes += [f"Column '{name}' does not hold numbers." for name in sorted(words)]
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
@@ -199,7 +205,7 @@ def read(path: Path, request: Request) -> Log:
 def read_column(path: Path, name: str, columns: CsvColumns | None = None,
                 ) -> tuple[FloatArray, FloatArray]:
     """Return the stamps, s, and one column of a CSV as written, NaN kept."""
-    table = _table(path, columns or CsvColumns(), more=(name,))
+    table = _table(path, columns or CsvColumns(), more=(name,), needed='')
     if name not in table.named:
         raise InputError(_absent(path, table.form, name))
     return table.t, table.named[name]
@@ -208,7 +214,7 @@ def read_column(path: Path, name: str, columns: CsvColumns | None = None,
 def read_throttle_alone(path: Path, columns: CsvColumns | None = None,
                         ) -> tuple[FloatArray, FloatArray]:
     """Return the stamps, s, and the throttle, 0..1, of a CSV that needs no voltage."""
-    table = _table(path, columns or CsvColumns())
+    table = _table(path, columns or CsvColumns(), needed='')
     if logs.THROTTLE not in table.found:
         raise InputError(_absent(path, table.form, THROTTLE, ' (--throttle-column)'))
     return table.t, table.found[logs.THROTTLE][1]
@@ -222,14 +228,14 @@ def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
             form = form_of(path, wanted, header=header)
             time = _time_of(path, form, wanted)
             if not _series_of(path, form, wanted, time):
-                _supply_of(path, form, wanted, time, needed=True)
+                _supply_of(path, form, wanted, time, ' (--voltage-column)')
             return True
     return False
 
 
-def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: bool = False,
-           left_out: list[str] | None = None) -> _Table:
-    """Read time, the columns of a supply, and others by name (needed: with a voltage)."""
+def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
+           needed: str = ' (--voltage-column)', left_out: list[str] | None = None) -> _Table:
+    """Read time, the columns of a supply, and others by name (needed: how to name a voltage)."""
     raw = form = form_of(path, wanted)
     time = clock = _time_of(path, form, wanted)
     if series := _series_of(path, form, wanted, time):
@@ -237,6 +243,9 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
         asked = {*more}
         more, time = form.names, time._replace(place=())
     found = _supply_of(path, form, wanted, time, needed)
+    if wanted.decimal is None and _has_thousands(form, time, found):
+        return _table(path, replace(wanted, decimal=','), more=more, needed=needed,
+                      left_out=left_out)
     others = {name: place for name in more if (place := _place_of(form, name)) is not None}
     for name, place in others.items():
         if place in time.place:
@@ -256,7 +265,8 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
         t, (mixed,) = _read(path, raw, clock, [value], left_out, {label: labels}, (
             label, frozenset(asked.union(column.name for column in found.values()))))
         mine, *others_of = (np.array(labels) == form.names[place] for place in places)
-        _check_one_series(path, raw, t, raw.names[value], np.where(mine, mixed, np.nan))
+        _check_one_series(path, raw, t, raw.names[value], np.where(mine, mixed, np.nan),
+                          (*clock.place, value))
         values, stamps, t = [mixed[mine]], t, t[mine]
         for rows in others_of:
             # Hold the last value of each other series at the stamps of the voltage.
@@ -274,7 +284,14 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
             volts).any() and len(form.names) > 2:
         raise InputError(f"{path}: '{found[logs.VOLTAGE].name}' is 0 or blank in every row, as "
                          'without its sensor: name another column by --voltage-column')
+    if logs.VOLTAGE in found and not series:
+        _check_one_series(path, form, t, found[logs.VOLTAGE].name, volts, (*time.place, *places))
     t, words = stamps_of(path, t, raw, wanted, clock)
+    even = spread(t, volts)
+    if not np.array_equal(even, t, equal_nan=True):
+        words += ', equal stamps spread evenly, a guess: --sample-interval'
+    rows, notes = lower_rows(even, volts)
+    volts, values = volts[rows], [one[rows] for one in values]
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
     rest = iter(values[len(found) + len(others):])
@@ -287,19 +304,29 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
         elif len(several) > 1:
             column_values = _mean_of_motors(several)
         column_values = column_values * factor_of(column.name)
-        si, guesses[quantity] = in_si(quantity, column, column_values, units.get(quantity), volts,
-                                      guesses.get(logs.VOLTAGE, ''))
+        si, guesses[quantity] = in_si(path, quantity, column, column_values,
+                                      units.get(quantity), volts, guesses.get(logs.VOLTAGE, ''))
         if quantity == logs.THROTTLE and len(several) > 1:
             guesses[quantity] += f', mean of {len(several)} motors'
         scaled[quantity] = column, si
-    if logs.VOLTAGE in scaled and not series:
-        column, si = scaled[logs.VOLTAGE]
-        _check_one_series(path, form, t, column.name, si)
-    even = spread(t, volts)
-    if not np.array_equal(even, t, equal_nan=True):
-        guesses[_TIME_NAME] += ', equal stamps spread evenly, a guess: --sample-interval'
     note = _read_note(form, time, found, guesses, wanted)
-    return _Table(form, time, even, scaled, dict(zip(others, values[len(found):])), note)
+    return _Table(form, time, even[rows], scaled, dict(zip(others, values[len(found):])),
+                  [note] * bool(note) + notes)
+
+
+def _has_thousands(form: Form, time: FileColumn, found: dict[str, FileColumn]) -> bool:
+    """Return whether points separate thousands: else the time falls, or volts are below 0.1."""
+    pointed = [cell for row in form.rows for cell in row if '.' in cell and is_number(cell)]
+    if form.delimiter not in ';\t' or form.comma or form.mark or not pointed or not all(
+            re.fullmatch(r'-?[1-9]\d{0,2}\.\d{3}', cell) for cell in pointed):
+        return False
+    whole = form._replace(rows=tuple(
+        tuple(cell.replace('.', '') for cell in row) for row in form.rows))
+    column = found.get(logs.VOLTAGE, time)
+    scale = SCALES.get(VOLT_WORDS.get(column.unit.lower(), ''), math.inf)
+    return any(not holds_clocks(form, k) and _rises(whole, k) > _rises(form, k)
+               for k in time.place) or scale < math.inf and bool(
+        scale * np.nanmedian(_times(form, column.place[0])) < 0.1)
 
 
 def _rest_of_group(form: Form, quantity: str, column: FileColumn, wanted: CsvColumns) -> list[int]:
@@ -374,8 +401,9 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
              and not re.fullmatch(others, plain[k] or ' ')]
     if not found and quantity == logs.VOLTAGE:
         # A column of 0 and 1 only is a line of a logic analyser.
-        found = [k for k in free if CHANNEL.fullmatch(plain[k] or ' ')
-                 and not {*form.cells(k)} <= {'0', '1'}]
+        found = sorted((k for k in free if CHANNEL.fullmatch(plain[k] or ' ')
+                        and not {*form.cells(k)} <= {'0', '1'}),
+                       key=lambda k: not _range_of(form, k) < 1.0)
     return found
 
 
@@ -406,7 +434,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> FileColumn:
         return _unit_column(form, first, wanted.time_unit)
     if 'sec' in form.names and (parts := _parts_of_second(form, form.names.index('sec'))):
         return parts
-    filled = _nameless_columns(form)
+    filled = [] if form.line else _nameless_columns(form)
     # Take the first column that rises in every row, else the first column if it never falls.
     rising = [k for k in filled[:len(filled) - 1] if len(form.rows) >= _FEW_ROWS and (
         np.diff(_times(form, k)) > 0.0).all()] or [k for k in filled[:1] if _rises(form, k)]
@@ -455,26 +483,35 @@ def _parts_of_second(form: Form, clock: int) -> FileColumn | None:
 
 
 def _nameless_columns(form: Form) -> list[int]:
-    """Return the columns of numbers whose names do not state a quantity."""
+    """Return the columns of numbers; with a header, those that may be a voltage."""
     filled = [k for k in range(form.width) if form.rows and len(form.cells(k)) == len(
         form.rows) and all(map(is_value, form.cells(k)))]
-    # In a file with names, only a single column beside the time; others may hold several series.
-    return filled if not form.line else [k for k in filled[1:] if form.width == 2 and re.fullmatch(
-        _VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])]
+    if not form.line:
+        return filled
+    # Beside the time a general name, or beside a throttle or current a level in decimals.
+    others = {*_choose(form, logs.THROTTLE), *_choose(form, logs.CURRENT)}
+    return [k for k in {*filled[1:]} - others if not form.units[k] and (
+        form.width == 2 and re.fullmatch(_VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])
+        or _range_of(form, k) < 1.0 and any('.' in cell for cell in form.cells(k)) and (
+            others and not re.search(_OTHERS, form.names[k].lower())
+            or re.fullmatch(_SUPPLY_NAME, _plain_names(form)[k])))]
+
+
+def _range_of(form: Form, place: int) -> float:
+    """Return the range of a column in the first rows relative to its mean; inf if below 1."""
+    # A load changes a supply's voltage by a few percent, and its current by far more.
+    values = np.array([number_of(cell)[0] for cell in form.cells(place) if is_number(cell)])
+    return float(np.ptp(values) / values.mean()) if values.size and values.min() >= 1.0 else (
+        math.inf)
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
     """Return the only column, or several if the first of them varies least; else none."""
-    # A load changes a supply's voltage by a few percent, and its current by far more.  Constant
-    # columns, and those anywhere below 1, are not compared.
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
         return places if len(places) == 1 else []
-    values = np.array([[number_of(row[k])[0] if is_number(row[k]) else math.nan for k in places]
-                       for row in form.rows])
-    spread = np.ptp(values, axis=0) / np.maximum(values.mean(axis=0), 1e-9)
-    able = np.flatnonzero((values.min(axis=0) >= 1.0) & (spread > 0.0) & (spread < 1.0))
-    least = able.size and np.argmin(spread[able]) == 0
-    return [places[k] for k in able] if least else []
+    # Constant columns are not compared.
+    spread = {k: size for k in places if 0.0 < (size := _range_of(form, k)) < 1.0}
+    return list(spread) if spread and min(spread.values()) == next(iter(spread.values())) else []
 
 
 def _times(form: Form, place: int) -> FloatArray:
@@ -507,7 +544,7 @@ def _stem(name: str) -> str:
         name)[0].lower())
 
 
-def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, needed: bool,
+def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, needed: str,
                ) -> dict[str, FileColumn]:
     """Return the columns of voltage, throttle and current that exist."""
     names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
@@ -526,6 +563,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
             found[quantity] = _unit_column(form, place, unit)
             continue
         places = _choose(form, quantity, taken)
+        guess = not places or CHANNEL.fullmatch(unit_of(form.names[places[0]])[0]) is not None
         if not places and quantity == logs.VOLTAGE:
             # Another option may name the column of the voltage; that is refused below.
             places = [k for k in _choose(form, quantity) if k in given]
@@ -535,7 +573,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
         if not places and quantity == logs.VOLTAGE:
             places = _steadiest(form, [k for k in _nameless_columns(form) if k not in taken])
         if places:
-            found[quantity] = _unit_column(form, places[0], unit)
+            found[quantity] = _unit_column(form, places[0], unit)._replace(guess=guess)
             taken.append(places[0])
     owners = dict.fromkeys(time.place, 'time')
     for quantity, column in found.items():
@@ -561,7 +599,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
         if form.line and not rest and not _choose(form, logs.VOLTAGE, text=True):
             raise InputError(f'{path} holds no voltage, only '
                              f'{some(list(filter(None, form.names)), 9)}')
-        raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column)'))
+        raise InputError(_absent(path, form, VOLTAGE, needed))
     return found
 
 
@@ -618,32 +656,37 @@ def _read(path: Path, form: Form, time: FileColumn, places: list[int],
 
 
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
-                      ) -> None:
-    """Raise InputError if a column of text names several series that share a column of values."""
-    # Stamps rise within each series.  Several series are likely if stamps go back (they overlap),
-    # or if the column of values has a general name.
+                      taken: Iterable[int]) -> None:
+    """Raise InputError if a column not taken names several series that share one of values."""
+    # Stamps rise within each series.  Several are likely if stamps go back or repeat, if values
+    # have general names, or if levels alternate; a random load changes in up to 2/3 of the rows.
     known = np.isfinite(t) & np.isfinite(values)
-    stamps = t[known]
+    stamps, levels = t[known], values[known]
     overlap = np.count_nonzero(
         stamps[1:] <= np.maximum.accumulate(stamps)[:-1]) > WILD * stamps.size
-    if not overlap and not re.fullmatch(_VALUE_NAME, column.lower()):
-        return
-    for place, label in enumerate(form.names[:form.width]):
+    general = overlap or re.fullmatch(_VALUE_NAME, column.lower())
+    for place in {*range(min(form.width, len(form.names)))}.difference(taken):
         first = form.cells(place)
-        cells = [] if not first or any(map(is_value, first)) or has_unit_beside(
-            form.names, place - 1) else _cells(path, form, place, t.size)
-        if not cells:
+        words = not any(map(is_value, first))
+        if not first or has_unit_beside(form.names, place - 1) or not (words and general or (
+                words or all(map(str.isdigit, first))) and 1 < len({*first}) <= _MOST_SERIES):
             continue
-        names, which = np.unique(np.array(cells)[known], return_inverse=True)
+        names, which = np.unique(np.array(
+            _cells(path, form, place, t.size) or known.size * [''])[known], return_inverse=True)
         if not 1 < names.size <= which.size / _FEW_ROWS:
             continue
         order = np.argsort(which, kind='stable')
         within = np.diff(stamps[order])[np.diff(which[order]) == 0]
-        if np.mean(within <= 0.0) <= WILD and (overlap or np.mean(np.diff(which) != 0) > _BACK):
+        turns, apart = np.mean(np.diff(which) != 0), np.array([np.quantile(
+            levels[which == k], (WILD, 0.5, 1.0 - WILD)) for k in range(names.size)]).T
+        if np.mean(within <= 0.0) <= WILD and (
+                words and overlap or turns > _BACK and general and (words or overlap)
+                or turns > 1.0 - _BACK and np.ptp(apart[1]) > (apart[2] - apart[0]).max()):
             raise InputError(
-                f"{path}: '{column}' holds several series, named in '{label}': "
-                f'{shown(some(map(printable, names), 3))}; '
-                f'{"name one with --voltage-column, or " * bool(form.line)}keep the rows of one')
+                f"{path}: '{column}' holds several series, named in '{form.names[place]}': "
+                f'{shown(some(map(printable, names), 3))}; ' + (
+                    'name one with --voltage-column, or ' * bool(form.line) if words else
+                    'name a load by --throttle-column, or ') + 'keep the rows of one')
 
 
 def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
@@ -657,6 +700,7 @@ def _read_note(form: Form, time: FileColumn, found: dict[str, FileColumn], units
                wanted: CsvColumns) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     encoding = '' if form.encoding in ('utf-8', 'utf-8-sig') else f', {form.encoding}'
+    thousands = ', points between thousands (--decimal)' * (form.mark == ',')
     used = {*time.place, *(column.place[0] for column in found.values())}
     lacking = [quantity for quantity in (logs.THROTTLE, logs.CURRENT)
                if quantity not in found and getattr(wanted, quantity) is None]
@@ -692,5 +736,5 @@ def _read_note(form: Form, time: FileColumn, found: dict[str, FileColumn], units
         options = ' or '.join(f'--{quantity}-column' for quantity in lacking)
         also += f'; not read: {some(rest, 3)} ({options})' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
-            f"{'comma' if form.comma else 'point'}{encoding}, numbers from line "
+            f"{'comma' if form.comma else 'point'}{thousands}{encoding}, numbers from line "
             f'{form.skip + 1} on{", without rows of outer tables" * (form.indent > 0)}.')

@@ -20,7 +20,7 @@ from ou_monitor.recordings.importers.csv_cells import (
 from ou_monitor.recordings.importers.csv_form import Form, holds_clocks
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import clock_unit, FloatArray, LONGEST_STEP, TIME_UNITS
-from ou_monitor.timeline import MOST_THROTTLE, WILD
+from ou_monitor.timeline import MOST_THROTTLE, Picked, WILD
 
 # Unit -> values at throttle 0 and 1; other values are written LOW:HIGH.
 THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'ms': (1.0, 2.0)}
@@ -41,7 +41,7 @@ _COUNTS, _DAY = 2.0**32, 86400.0
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 # Maximum change by rounding, V; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0
-# A voltage without a unit above this is in mV: no craft's pack has that many volts.
+# No craft's pack has more V: without a unit it is mV, and whole numbers above a tenth are counts.
 _MOST_VOLTS = 1000.0
 # A throttle without a unit is not taken for percent up to this maximum: levers give up to 5 V.
 _LEAST_PERCENT = 5.5
@@ -55,6 +55,7 @@ class FileColumn(NamedTuple):
     unit: str  # As stated or given, '' if neither
     scale: float  # Factor by the maker's definition; 0: by the unit
     unknown: float = math.nan  # Number that stands for "unknown"
+    guess: bool = False  # Whether the name does not tell the quantity
 
 
 def unwrapped(t: FloatArray) -> FloatArray:
@@ -159,7 +160,19 @@ def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
         np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
 
 
-def in_si(quantity: str, column: FileColumn, values: FloatArray, given: str | None,
+def lower_rows(t: FloatArray, volts: FloatArray) -> tuple[Picked, list[str]]:
+    """Return which rows to keep, if each stamp has two the lower ones, and notes."""
+    first, second = (np.arange(k, t.size // 2 * 2, 2) for k in (0, 1))
+    change = volts[second] - volts[first]
+    if not (change.size and np.isfinite(volts).all() and (t[first] == t[second]).all() and (
+            np.diff(t[first]) > 0.0).all() and 2 * np.count_nonzero(change) > change.size):
+        return slice(None), []
+    return np.append(np.where(change < 0.0, second, first), np.arange(2 * first.size, t.size)), [
+        'Each stamp has two rows, as in an envelope: the row of the lower voltage was kept; if '
+        'they are in turn, give --sample-interval.']
+
+
+def in_si(path: Path, quantity: str, column: FileColumn, values: FloatArray, given: str | None,
           volts: FloatArray, beside: str) -> tuple[FloatArray, str]:
     """Return values in V, 0..1 or A, and their unit in words (beside: the voltage's unit)."""
     known = np.abs(values[np.isfinite(values)])
@@ -182,7 +195,7 @@ def in_si(quantity: str, column: FileColumn, values: FloatArray, given: str | No
             '0..1' if unit == '1' else unit) + words
     # Use the maker's factor, unless it makes a supply of less than 1 V: then the numbers were
     # converted already, under the same names.
-    if column.scale and 'V' not in (given, beside) and (
+    if column.scale and 'V' not in (given, beside.split(',')[0]) and (
             math.isnan(column.unknown) or (known == np.rint(known)).all()) and (
             quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
         return np.where(values == column.unknown, np.nan, values * column.scale), column.unit
@@ -193,8 +206,12 @@ def in_si(quantity: str, column: FileColumn, values: FloatArray, given: str | No
         return values * SCALES[unit], unit + ', a guess' * small
     unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
     if not unit:
-        unit, words = ('mV', ', a guess: --unit') if known.size and np.median(
-            known) > _MOST_VOLTS else ('V', '')
+        usual = float(np.median(known)) if known.size else 0.0
+        if 0.1 * _MOST_VOLTS < usual <= _MOST_VOLTS and (known == np.rint(known)).all():
+            raise InputError(f"{path}: '{column.name}' has whole numbers about {usual:g} and no "
+                             'stated unit: convert counts to V, or give --unit V or mV')
+        unit = 'mV' if usual > _MOST_VOLTS else 'V'
+        words = ', a guess: ' + '--voltage-column and ' * column.guess + '--unit'
     return values * SCALES[unit], unit + words
 
 

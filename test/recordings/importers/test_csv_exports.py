@@ -31,6 +31,10 @@ def german(value):
     return f'{value}'.replace('.', ',')
 
 
+def thousands(value):
+    return f'{value:,.0f}'.replace(',', '.')
+
+
 def clock(k, pattern='%Y-%m-%d %H:%M:%S.%f', step=0.01):
     return (BEGIN + timedelta(seconds=step * k)).strftime(pattern)
 
@@ -444,6 +448,31 @@ FORMS = {
         0.1, False, True),
     'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
         f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
+    # Points between thousands, shown by the unit, the time or commas elsewhere.
+    'excel_de_points': (table(['Zeit (ms);U_Akku (mV);PWM (µs)'], lambda k: ';'.join(map(
+        thousands, (100 * k, 1e3 * V[k], 1e3 + 1e3 * U[k])))), 0.1, True, False),
+    'excel_de_time': (table(['Zeit (ms);Akkuspannung'], lambda k: ';'.join(map(
+        thousands, (100 * k, 1e3 * V[k])))), 0.1, False, False),
+    'excel_de_both': (table(['Zeit (s);U_Akku (mV);Gas (%)'], lambda k: ';'.join(
+        (german(round(0.1 * k, 1)), thousands(1e3 * V[k]), german(round(100 * U[k], 1))))), 0.1,
+        True, False),
+    'excel_ch': (table(['Zeit (s);U_Akku (mV)'], lambda k: (
+        f'{0.1 * k:.1f};' + thousands(1e3 * V[k]).replace('.', "'"))), 0.1, False, False),
+    # One level that is left beside a throttle or has a supply's name; facts beside the first rows.
+    'lvm_akku': (table(['X_Value\tU_Akku\tGas\tComment'], lambda k: '\t'.join(
+        map(german, (round(0.1 * k, 1), V[k], U[k], '')))), 0.1, True, False),
+    'supply': (table(['t,supply,command'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'), 0.1, False,
+               False),
+    'pwm': (table(['t,B1,pwm'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'), 0.1, True, False),
+    'micsig': (table(['ProID,Info,,time,Vol.,'], lambda k: (
+        f"{('Model,STO1104C', 'Record Length,4000', ',')[min(k, 2)]},,{0.1 * k:.1f},{V[k]},")),
+        0.1, False, False),
+    # A signal before the supply.
+    'saleae_second': (table(['Time [s],Channel 0,Channel 1'], lambda k: (
+        f'{0.1 * k:.1f},{3.3 * (k % 2):.3f},{V[k]}')), 0.1, False, False),
+    # The lowest and the highest of each interval.
+    'rohde_pairs': (table(['in s,C1 in V'], lambda k: (
+        f'{0.1 * k:.6E},{V[k] + 0.1:.4E}\n{0.1 * k:.6E},{V[k]:.4E}')), 0.1, False, False),
 }
 
 
@@ -699,17 +728,75 @@ def test_rows_that_share_a_stamp_are_spread(step, atol, tmp_path):
 
 
 @pytest.mark.parametrize('stamps, volts', [
-    # Rows repeated, two packs in turn, and no steady number.
+    # Rows repeated, and no steady number.
     (np.arange(900) // 10, np.repeat(_RNG.normal(12.0, 0.1, 90), 10)),
-    (np.arange(900) // 2, 12.0 + 0.3 * (np.arange(900) % 2) + 0.02 * _RNG.standard_normal(900)),
     (np.cumsum(_RNG.random(900) < 0.1), _RNG.normal(12.0, 0.1, 900))])
 def test_other_rows_that_share_a_stamp_are_dropped(stamps, volts, tmp_path):
     path = written(tmp_path, 'time,U\n' + ''.join(
         f'{clock(int(k), "%H:%M:%S", 1.0)},{u:.3f}\n' for k, u in zip(stamps, volts)))
     found = read_recording(path)
     assert found.n == np.unique(stamps).size and 'dropped: repeated stamp' in found.notes[-1]
-    assert any('--sample-interval' in note for note in found.notes) == (
-        stamps.size > 2 * np.unique(stamps).size)
+    assert any('--sample-interval' in note for note in found.notes)
+
+
+@pytest.mark.parametrize('first', ['high', 'low'])
+def test_the_lower_of_two_rows_with_one_stamp_is_kept(first, tmp_path):
+    """With its current; the last row has no partner; --sample-interval keeps all."""
+    volts = np.append(np.repeat(V, 2), V[-1])
+    volts[first == 'low':-1:2] += 0.3
+    path = written(tmp_path, 't,U,I\n' + ''.join(
+        f'{k // 2},{u:.3f},{10 * u:.2f}\n' for k, u in enumerate(volts)))
+    found = read_recording(path)
+    np.testing.assert_allclose(found.voltage, [*V, V[-1]])
+    np.testing.assert_allclose(found.current, 10.0 * found.voltage)
+    assert 'lower voltage' in found.notes[-1]
+    assert read_recording(path, columns=CsvColumns(sample_interval=0.5)).n == 2 * N + 1
+
+
+@pytest.mark.parametrize('header, row, words', [
+    ('time_s,id,voltage', lambda k: f'{0.1 * k:.1f},{k % 2},{V[k] / (1 + k % 2)}',
+     "named in 'id': 0, 1; name a load by --throttle-column, or keep the rows of one"),
+    ('time_s,battery,voltage',
+     lambda k: f"{0.1 * k:.1f},{('front', 'rear')[k % 2]},{V[k] / (1 + k % 2)}",
+     "named in 'battery': front, rear; name one with --voltage-column, or keep"),
+    # Equal levels at equal stamps.
+    ('TimeUS,Inst,Volt', lambda k: f'{100000 * (k // 3)},{k % 3},{V[k]}', "'Inst': 0, 1, 2"),
+    ('millis,A0,A1', lambda k: f'{40 * k},{50 * V[k]:.0f},{1e3 * U[k]:.0f}', 'A0.*convert counts'),
+    ('ms,vbat', lambda k: f'{10 * k},{50 * V[k]:.0f}', 'no stated unit: .* give --unit V or mV')])
+def test_several_series_and_counts_are_refused(header, row, words, tmp_path):
+    path = written(tmp_path, table([header], row))
+    with pytest.raises(InputError, match=words):
+        read_recording(path)
+    # A bag is not written either.
+    with pytest.raises(InputError, match=words):
+        import_log(path, Request())
+    if 'battery' in header:
+        found = read_recording(path, columns=CsvColumns(voltage='rear'))
+        np.testing.assert_allclose(found.voltage, V[1::2] / 2)
+    elif 'id' in header:
+        assert read_recording(path, columns=CsvColumns(throttle='id')).n == N
+    elif 'vbat' in header:
+        assert read_recording(path, columns=CsvColumns(unit='V')).n == N
+
+
+@pytest.mark.parametrize('header, row, told', [
+    # A load at random, or without an effect on the level, is no series.
+    ('t [s],relay,U [V]', lambda k: f'{0.1 * k:.1f},{k * k % 7 % 2},{12.0 - k * k % 7 % 2}', 'V'),
+    ('t [s],flag,U [V]', lambda k: f'{0.1 * k:.1f},{k % 2},{V[k]}', 'V'),
+    # Decimals between semicolons, although three of them.
+    ('t [s];U [V]', lambda k: f'{0.1 * k:.3f};{V[k]:.3f}', 'V'),
+    ('time,voltage', lambda k: f'{0.1 * k:.1f},{V[k]}', 'V, a guess: --unit'),
+    ('time,CH1', lambda k: f'{0.1 * k:.1f},{V[k]}', 'V, a guess: --voltage-column and --unit')])
+def test_the_unit_and_the_column_of_a_voltage_are_marked_if_guessed(header, row, told, tmp_path):
+    note = read_recording(written(tmp_path, table([header], row))).notes[0]
+    assert f"' ({told})" in note.split('voltage from')[1]
+
+
+@pytest.mark.parametrize('header', ['t,throttle,temp', 't,throttle,load1,load2', 't,level'])
+def test_a_level_is_no_voltage_if_it_may_be_something_else(header, tmp_path):
+    with pytest.raises(InputError, match="no column 'voltage_v'"):
+        read_recording(written(tmp_path, table([header], lambda k: ','.join(
+            map(str, (0.1 * k, U[k], V[k], V[k] + 1)[:header.count(',') + 1])))))
 
 
 def test_the_unit_of_a_throttle(tmp_path):
@@ -888,8 +975,11 @@ def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
                    f'{clock(k)},1,sys_status_t,load,333,voltage_battery,16000',
      'messages of several kinds')])
 def test_dead_sensors_and_logic_lines_are_no_voltage(header, row, words, tmp_path):
-    with pytest.raises(InputError, match=words):
-        read_recording(written(tmp_path, table([header], row)))
+    """Nor does `convert` say less than `analyze`."""
+    path = written(tmp_path, table([header], row))
+    for read in read_recording, lambda path: import_log(path, Request()):
+        with pytest.raises(InputError, match=words):
+            read(path)
 
 
 @pytest.mark.parametrize('unit, asked', [('ms', True), ('s', False)])
