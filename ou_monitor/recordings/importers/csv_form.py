@@ -65,7 +65,7 @@ DELIMITERS = {'tab': '\t', 'space': ' '}
 _OF_NAMES = re.compile('name|trace|label|channel', re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 # A number with points or commas between thousands, which is not part of a date or a clock.
-_OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
+_OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])[1-9]\d{{,2}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
                         for mark in (r'\.', ','))
 _OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?[^",\d]*"')
 # A number that shows that the decimal mark is a point.

@@ -493,16 +493,16 @@ def _nameless_columns(form: Form) -> list[int]:
     return [k for k in {*filled[1:]} - others if not form.units[k] and (
         form.width == 2 and re.fullmatch(_VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])
         or _range_of(form, k) < 1.0 and any('.' in cell for cell in form.cells(k)) and (
-            others and not re.search(_OTHERS, form.names[k].lower())
+            others and not re.search(f'{_OTHERS}|rpm|alt|speed|pres|power|energ|rate|acc|gyro',
+                                     form.names[k].lower())
             or re.fullmatch(_SUPPLY_NAME, _plain_names(form)[k])))]
 
 
 def _range_of(form: Form, place: int) -> float:
     """Return the range of a column in the first rows relative to its mean; inf if below 1."""
     # A load changes a supply's voltage by a few percent, and its current by far more.
-    values = np.array([number_of(cell)[0] for cell in form.cells(place) if is_number(cell)])
-    return float(np.ptp(values) / values.mean()) if values.size and values.min() >= 1.0 else (
-        math.inf)
+    found = np.array([number_of(cell)[0] for cell in form.cells(place) if is_number(cell)])
+    return float(np.ptp(found) / found.mean()) if found.size and found.min() >= 1.0 else math.inf
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
@@ -659,14 +659,14 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
                       taken: Iterable[int]) -> None:
     """Raise InputError if a column not taken names several series that share one of values."""
     # Stamps rise within each series.  Several are likely if stamps go back or repeat, if values
-    # have general names, or if levels alternate; a random load changes in up to 2/3 of the rows.
+    # have general names, or if levels or ids alternate; random loads do so in up to 2/3 of rows.
     known = np.isfinite(t) & np.isfinite(values)
     stamps, levels = t[known], values[known]
     overlap = np.count_nonzero(
         stamps[1:] <= np.maximum.accumulate(stamps)[:-1]) > WILD * stamps.size
     general = overlap or re.fullmatch(_VALUE_NAME, column.lower())
     for place in {*range(min(form.width, len(form.names)))}.difference(taken):
-        first = form.cells(place)
+        label, first = form.names[place], form.cells(place)
         words = not any(map(is_value, first))
         if not first or has_unit_beside(form.names, place - 1) or not (words and general or (
                 words or all(map(str.isdigit, first))) and 1 < len({*first}) <= _MOST_SERIES):
@@ -675,15 +675,15 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
             _cells(path, form, place, t.size) or known.size * [''])[known], return_inverse=True)
         if not 1 < names.size <= which.size / _FEW_ROWS:
             continue
-        order = np.argsort(which, kind='stable')
-        within = np.diff(stamps[order])[np.diff(which[order]) == 0]
+        within = np.concatenate([np.diff(stamps[which == k]) for k in range(names.size)])
         turns, apart = np.mean(np.diff(which) != 0), np.array([np.quantile(
             levels[which == k], (WILD, 0.5, 1.0 - WILD)) for k in range(names.size)]).T
-        if np.mean(within <= 0.0) <= WILD and (
-                words and overlap or turns > _BACK and general and (words or overlap)
+        if np.mean(within <= 0.0) <= WILD and (words and overlap or turns > _BACK and (
+                overlap or words and general or re.fullmatch(
+                    '(.*[ _])?(id|inst(ance)?|batt(ery)?|pack)', label.lower()))
                 or turns > 1.0 - _BACK and np.ptp(apart[1]) > (apart[2] - apart[0]).max()):
             raise InputError(
-                f"{path}: '{column}' holds several series, named in '{form.names[place]}': "
+                f"{path}: '{column}' holds several series, named in '{label}': "
                 f'{shown(some(map(printable, names), 3))}; ' + (
                     'name one with --voltage-column, or ' * bool(form.line) if words else
                     'name a load by --throttle-column, or ') + 'keep the rows of one')

@@ -456,6 +456,10 @@ FORMS = {
     'excel_de_both': (table(['Zeit (s);U_Akku (mV);Gas (%)'], lambda k: ';'.join(
         (german(round(0.1 * k, 1)), thousands(1e3 * V[k]), german(round(100 * U[k], 1))))), 0.1,
         True, False),
+    # Another column has decimal points.
+    'excel_de_mixed': (table(['Zeit (s);U (V);Gas;Lat'], lambda k: (
+        f"{german(f'{0.1 * k:.3f}')};{german(f'{V[k]:.3f}')};{german(f'{U[k]:.3f}')};48.123456")),
+        0.1, True, False),
     'excel_ch': (table(['Zeit (s);U_Akku (mV)'], lambda k: (
         f'{0.1 * k:.1f};' + thousands(1e3 * V[k]).replace('.', "'"))), 0.1, False, False),
     # One level that is left beside a throttle or has a supply's name; facts beside the first rows.
@@ -759,7 +763,9 @@ def test_the_lower_of_two_rows_with_one_stamp_is_kept(first, tmp_path):
     ('time_s,battery,voltage',
      lambda k: f"{0.1 * k:.1f},{('front', 'rear')[k % 2]},{V[k] / (1 + k % 2)}",
      "named in 'battery': front, rear; name one with --voltage-column, or keep"),
-    # Equal levels at equal stamps.
+    # Equal levels, at stamps in turn or equal.
+    ('time_s,battery_id,voltage', lambda k: f'{0.1 * k:.1f},{k % 2},{V[k]}', "'battery_id': 0, 1"),
+    ('time_s,id,voltage', lambda k: f'{0.1 * k:.1f},{k % 5 // 4},{V[k]}', "'id': 0, 1"),
     ('TimeUS,Inst,Volt', lambda k: f'{100000 * (k // 3)},{k % 3},{V[k]}', "'Inst': 0, 1, 2"),
     ('millis,A0,A1', lambda k: f'{40 * k},{50 * V[k]:.0f},{1e3 * U[k]:.0f}', 'A0.*convert counts'),
     ('ms,vbat', lambda k: f'{10 * k},{50 * V[k]:.0f}', 'no stated unit: .* give --unit V or mV')])
@@ -770,10 +776,10 @@ def test_several_series_and_counts_are_refused(header, row, words, tmp_path):
     # A bag is not written either.
     with pytest.raises(InputError, match=words):
         import_log(path, Request())
-    if 'battery' in header:
+    if 'battery,' in header:
         found = read_recording(path, columns=CsvColumns(voltage='rear'))
         np.testing.assert_allclose(found.voltage, V[1::2] / 2)
-    elif 'id' in header:
+    elif ',id' in header:
         assert read_recording(path, columns=CsvColumns(throttle='id')).n == N
     elif 'vbat' in header:
         assert read_recording(path, columns=CsvColumns(unit='V')).n == N
@@ -792,7 +798,8 @@ def test_the_unit_and_the_column_of_a_voltage_are_marked_if_guessed(header, row,
     assert f"' ({told})" in note.split('voltage from')[1]
 
 
-@pytest.mark.parametrize('header', ['t,throttle,temp', 't,throttle,load1,load2', 't,level'])
+@pytest.mark.parametrize('header', [
+    't,throttle,temp', 't,throttle,rpm', 't,throttle,load1,load2', 't,level'])
 def test_a_level_is_no_voltage_if_it_may_be_something_else(header, tmp_path):
     with pytest.raises(InputError, match="no column 'voltage_v'"):
         read_recording(written(tmp_path, table([header], lambda k: ','.join(
