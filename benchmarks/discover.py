@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 import json
+import math
 import multiprocessing
 from pathlib import Path
 import signal
@@ -39,6 +40,15 @@ from hidden_registry import EFFECTS as BASES
 from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import discover
+from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.gain import guess
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role
 from ou_monitor.records import Recording
 from scipy.stats import binomtest
 
@@ -223,6 +233,40 @@ def nulls(given: argparse.Namespace) -> str:
                   'something left', 'median CPU s'], rows)
 
 
+def best_evidence(seed: int) -> float:
+    """Return the evidence of the best cause, nats, in a simulated OU with nothing hidden."""
+    rng = np.random.default_rng(seed)
+    rate, n = 10.0 ** rng.uniform(2.0, 3.0), round(10.0 ** rng.uniform(3.5, 4.5))
+    alpha, stick = rate * 10.0 ** rng.uniform(-2.0, -0.3), rng.uniform(0.6, 3.0)
+    t = np.arange(n) / rate
+    voltage, throttle = (SupplyModel((OU(a, std * math.sqrt(2.0 * a), 0.0),)).simulate(t, rng)
+                         for a, std in ((alpha, 0.02), (stick, 1.0)))
+    samples = Samples(t, voltage, 1.0 / (1.0 + np.exp(-throttle)) if seed % 2 else None)
+    fitter, found = Fitter(samples), -np.inf
+    plain = fit_composite(samples, [guess(samples)], samples.train)
+    view, before = fitter.view(plain), fitter.evidence(plain)
+    for kind in catalogue().values():
+        if kind.NAME == 'ou' or kind.ROLE is Role.EXACT or (
+                kind.NEEDS_THROTTLE and samples.throttle is None):
+            continue
+        start = fitter.best_start(plain, kind, view, -1e3)
+        full = None if start is None else fitter.fit(start.terms, start)
+        found = max(found, *(fitter.evidence(fit) - before for fit in (start, full) if fit), -1e3)
+    return found
+
+
+def evidence(given: argparse.Namespace) -> str:
+    """Measure the evidence of the best cause where nothing is hidden."""
+    # Kinds are compared before the threshold, so that its effect can be computed.
+    decision.ACCEPT = -1e3
+    found = np.array([best_evidence(given.seed + k) for k in range(given.each)])
+    # With a slope of one nat per e-fold, as the share above -1 nat has it.
+    scale = 1.0 - np.log(np.mean(found > -1.0))
+    return table(['evidence above, nats', 'recordings', f'exp(-{scale:.1f} - x)'], [
+        [f'{x:g}', f'{100.0 * np.mean(found > x):.1f} %', f'{100.0 * np.exp(-scale - x):.2g} %']
+        for x in (-2.0, -1.0, 0.0, 1.0, 2.0, 4.0)])
+
+
 # -- recorded runs
 
 
@@ -383,8 +427,11 @@ def main() -> int:
     more = add('nulls', nulls, False)
     more.add_argument('--each', type=int, default=40, help='recordings of each base')
     more.add_argument('--bases', nargs='+', choices=('plain', 'flown'), default=['plain', 'flown'])
-    for one in (part, more):
+    null = add('evidence', evidence, False)
+    null.add_argument('--each', type=int, default=240, help='recordings')
+    for one in (part, more, null):
         one.add_argument('--seed', type=int, default=SEED)
+    for one in (part, more):
         one.add_argument('--lines', type=Path,
                          help='JSON lines: results are added; those in it are not run again')
     part = add('flights', recorded_runs, True)

@@ -399,7 +399,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
                         'a Recording or a path as recording=')
     values = dict(network or {})
     if cells:
-        values['cells'] = cells
+        if values.setdefault('cells', cells) != cells:
+            raise InputError(f'cells: {cells} and {values["cells"]} are both given: give one; for '
+                             'a pack of another voltage, --set battery_voltage=V')
         voltage = pack_limit(voltage, cells) if voltage and rail == 'bus' else voltage
     taken, facts, error, known, assumed = '', None, 0.0, None, False
     if recording is None:

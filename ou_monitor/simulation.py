@@ -96,6 +96,12 @@ def read_profile(text: str, columns: CsvColumns | None = None) -> Profile:
     """Return the profile that a text describes (columns: for a CSV)."""
     if text in PROFILES:
         return PROFILES[text][0]
+    points = _points_of(text, columns)
+    return constant(float(text)) if points is None else through(points)
+
+
+def _points_of(text: str, columns: CsvColumns | None) -> list[tuple[float, float]] | None:
+    """Return the points, s and 0..1, of a text or a CSV; None if the text is a number."""
     if text.lower().endswith('.csv') or Path(text).is_file():
         return _from_csv(Path(text), columns)
     try:
@@ -105,9 +111,9 @@ def read_profile(text: str, columns: CsvColumns | None = None) -> Profile:
             raise InputError(
                 f"no throttle profile '{printable(text, 60)}': {nearest(text, PROFILES)} (or give "
                 'a number 0..1, points T:U,T:U,..., a CSV file or a recording)') from None
-        return through(_checked(_points(text), f"throttle '{text}'"))
+        return _checked(_points(text), f"throttle '{text}'")
     _check_throttle(number, f"throttle '{text}'")
-    return constant(number)
+    return None
 
 
 def _points(text: str) -> list[tuple[float, float]]:
@@ -139,13 +145,13 @@ def _check_throttle(value: float, where: str) -> None:
         raise InputError(f'{where}: throttle must be a number 0..1, got {value:g}')
 
 
-def _from_csv(path: Path, columns: CsvColumns | None) -> Profile:
+def _from_csv(path: Path, columns: CsvColumns | None) -> list[tuple[float, float]]:
     t, throttle = read_throttle_alone(path, columns)
     if not t.size:
         raise InputError(f'{path} holds no row')
     # Stamps since 1970 are counted from the first one.
     t = t - (t[0] if clock_unit(t[0]) else 0.0)
-    return through(_checked(list(zip(t.tolist(), throttle.tolist())), str(path)))
+    return _checked(list(zip(t.tolist(), throttle.tolist())), str(path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,10 +409,10 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
         file, name = model if isinstance(model, ModelFile) else ModelFile(model), 'model'
     still = throttle is None and model is not None and not (
         file.model.needs_throttle or file.model.load)
-    profile, words, flown = (constant(NAN), 'none', None) if still else _throttle_of(
+    profile, words, flown, length = (constant(NAN), 'none', None, NAN) if still else _throttle_of(
         usual.throttle if throttle is None else throttle, start, end, columns,
         file.model.full_current)
-    length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
+    length = length if length > 0.0 else usual.duration
     rate = _positive('--rate', _rate_of(file, usual.rate) if rate is None else rate, 'Hz')
     duration = _positive('--duration', length if duration is None else duration, 's')
     if not 1.0 <= duration * rate <= 1e12:
@@ -431,20 +437,25 @@ def _rate_of(file: ModelFile, usual: float) -> float:
 
 
 def _throttle_of(throttle: Any, start: float | None, end: float | None,
-                 columns: CsvColumns | None, full: float) -> tuple[Profile, str, Recording | None]:
-    """Return the profile of a throttle, its name, and the recording that it is from."""
+                 columns: CsvColumns | None, full: float
+                 ) -> tuple[Profile, str, Recording | None, float]:
+    """Return the profile of a throttle, its name, its recording, and its length, s, or NaN."""
+    found: RecordedThrottle | None = None
+    words = throttle.name if isinstance(throttle, Recording) else str(throttle)
     if isinstance(throttle, Recording):
-        return recorded_throttle(throttle, throttle.name, full).profile, throttle.name, throttle
-    if callable(throttle):
-        return throttle, 'given', None
-    words = str(throttle)
-    if is_recording(words, columns):
+        found = recorded_throttle(throttle, words, full)
+    elif callable(throttle):
+        return throttle, 'given', None, NAN
+    elif is_recording(words, columns):
         found = read_throttle(words, start, end, columns, full)
-        return found.profile, words, found.recording
+    if found is not None:
+        return found.profile, words, found.recording, found.duration
     if start is not None or end is not None:
         raise InputError('--from and --to take a part of a recorded throttle: give --throttle '
                          'RECORDING')
-    return read_profile(words, columns), words, None
+    points = None if words in PROFILES else _points_of(words, columns)
+    return (read_profile(words), words, None, NAN) if points is None else (
+        through(points), words, None, points[-1][0])
 
 
 def _positive(name: str, value: float, unit: str) -> float:

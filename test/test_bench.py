@@ -249,6 +249,11 @@ def test_an_argument_of_a_wrong_type_is_named(call, words):
         call()
 
 
+def test_two_numbers_of_cells_are_refused():
+    with pytest.raises(InputError, match='4 and 5 are both given'):
+        design(0.5, cells=4, network={'cells': 5})
+
+
 @pytest.mark.parametrize('scale', [100.0, 2000.0])
 def test_a_throttle_in_another_unit_is_refused(scale):
     """Percent and us, as the readers do; a single wild value is an error of its own."""

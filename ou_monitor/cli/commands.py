@@ -467,8 +467,9 @@ _SIMULATE = Command(
             help="samples per second (default: as in the preset or the model's recording)"),
      seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
-            help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV of time and '
-            'throttle, or a recording, whose length is then the default'),
+            help='name of a profile, a number 0..1, points T:U,T:U,... or a CSV of time and '
+            'throttle (linear between the points), or a recording (each value holds until the '
+            'next); the default length is that of the points or the recording'),
      *PART, *COLUMNS,
      Option('--capacity-left', metavar='X', type=NUMBER,
             help='initial charge, 0..1; the battery then discharges by throttle, not by the term '

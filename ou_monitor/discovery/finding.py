@@ -83,7 +83,7 @@ class LowDips:
 
     level: float = NAN  # V
     count: int = 0  # Dips in the samples
-    made: int | None = None  # Dips mostly caused by the load; None: no response to load
+    made: int | None = None  # Dips that the lowest load avoids; None: no response to load
     # Dips per minute in the samples and on average in simulations.
     observed: float = NAN
     baseline: float = NAN

@@ -422,7 +422,11 @@ def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, d
             if isinstance(term, LoadTransient) and not term.delay}
     moved = [replace(term, tau=term.tau * math.exp(by)) for term in lags.values()
              for by in (_STEP, -_STEP)]
-    columns = whitened(samples, terms, moved, own=True)[part, 1:]
+    try:
+        columns = whitened(samples, terms, moved, own=True)[part, 1:]
+    except (ValueError, ArithmeticError):
+        # Without its events, the filter of the model is singular.
+        return {k: dict.fromkeys(terms[k].LINEAR, math.inf) for k, _ in where}
     through, rest = columns[:, :len(where)], columns[:, len(where):]
     for k in lags:
         # The derivative of the mean with respect to ln(tau).

@@ -25,9 +25,8 @@ _DIGITS = (4, 6)
 _DRAWS = 8
 # Quantiles of the load between which a fall is measured.
 _FLOWN = (0.01, 0.99)
-# Maximum time between a dip and its predicted minimum, s; a dip counts as caused by the load if
-# the load predicts more than this share of its depth.
-_NEAR, _MADE = 0.05, 0.5
+# Maximum time between a dip and its predicted minimum, s.
+_NEAR = 0.05
 
 
 def low_dips(samples: Samples, rise: FloatArray, baseline: Sequence[Term],
@@ -50,7 +49,9 @@ def low_dips(samples: Samples, rise: FloatArray, baseline: Sequence[Term],
     responses = _responses(samples, extended)
     # Poisson error, at least the error of one dip.
     return LowDips(level, int(begins.size),
-                   _made(samples, _path(samples, responses), level, begins) if responses else None,
+                   _made(samples, _path(samples, [
+                       term for term in responses if term.NEEDS_THROTTLE]), level, begins)
+                   if responses else None,
                    begins.size / minutes, rates[0][0], rates[1][0],
                    math.sqrt(max(begins.size, 1.0)) / minutes, rates[0][1], rates[1][1])
 
@@ -105,12 +106,12 @@ def _path(samples: Samples, responses: Sequence[Term]) -> FloatArray:
 
 
 def _made(samples: Samples, path: FloatArray, level: float, begins: npt.NDArray[np.intp]) -> int:
-    """Return the number of dips that the path of the load caused."""
+    """Return the number of dips that would not have happened at the lowest load."""
     v, t, made = samples.logged, samples.t, 0
-    depth, usual = float(np.median(v)), float(np.median(path))
+    assert samples.throttle is not None
+    idle = float(np.median(path[samples.throttle <= np.quantile(samples.throttle, _FLOWN[0])]))
     for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), v.size]):
         bottom = begin + int(np.argmin(v[begin:end]))
         first, last = np.searchsorted(t, [t[bottom] - _NEAR, t[bottom] + _NEAR])
-        lowest = float(path[first:last + 1].min())
-        made += usual - lowest > _MADE * (depth - float(v[bottom]))
+        made += float(v[bottom]) + idle - float(path[first:last + 1].min()) >= level
     return made

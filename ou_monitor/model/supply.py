@@ -102,8 +102,7 @@ class SupplyModel:
         """
         Draw a recording, V (t in s, rising).
 
-        throttle: 0..1, shape (n,), each value for the time since the previous stamp; or one
-        number.
+        throttle: 0..1, shape (n,), each held until the next stamp; or one number.
         """
         stamps = np.asarray(t, dtype=np.float64)
         load = None if throttle is None else np.broadcast_to(

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
-from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line
+from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line, LOWEST_CELL
 from ou_monitor.analysis.level_comparison import NARROW, sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.noise import BAND
@@ -74,8 +74,18 @@ def answer(analysis: Analysis) -> list[str]:
     supply = [first, *safe, *others, *craft_advice(analysis.craft)]
     # If the voltage has the wrong sign, only its noise is meaningful; if it is stuck, nothing is.
     meaningless = {item.name for item in faults(analysis.recording)} & {'VOLTAGE_SIGN', 'STUCK'}
-    return [*analysis.overview.beware, *([] if meaningless else supply),
+    return [*analysis.overview.beware, *_low_limit(analysis), *([] if meaningless else supply),
             *_numbers(analysis), *_change(analysis)]
+
+
+def _low_limit(analysis: Analysis) -> list[str]:
+    """Return a warning if the limit is too low for the pack, as one per cell would be."""
+    limit, craft = analysis.by_throttle.voltage, analysis.craft
+    if not (craft.measures and limit < LOWEST_CELL * craft.cells) or analysis.brownout_default:
+        return []
+    return [f'Check the limit: {limit:g} V is {number(limit / craft.cells, 2)} V per cell if this '
+            f'is a pack of {counted(craft.cells, "cell")}. A limit per cell needs '
+            f'--cells {craft.cells} too.']
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:

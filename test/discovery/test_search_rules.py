@@ -167,7 +167,7 @@ def test_starts_are_ordered_by_the_scores_they_explain():
 
 
 @pytest.mark.parametrize('name, price', [
-    ('load_dependent_noise', 10.0), ('drift', 6.0), ('load_dependent_sigma', 6.0)])
+    ('load_dependent_noise', 10.0), ('drift', 4.0), ('load_dependent_sigma', 4.0)])
 def test_a_second_curve_must_add_a_tenth_of_the_first(name, price):
     # A rough fit of the table is a nat worse.
     fitter = Table({('measurement_noise',): 401.0})

@@ -35,18 +35,18 @@ def test_transient_of_a_step(gain, tau):
     """A step from 20 to 70 % shows as 0.5 gain exp(-t/tau) and nothing before."""
     found = level(term('load_transient', gain=gain, tau=tau, delay=0.0),
                   throttle=step_at(100, 0.2, 0.7))
-    since = T - T[99]
+    since = T - T[100]
     np.testing.assert_allclose(
-        found, np.where(since > 0.0, 0.5 * gain * np.exp(-since / tau), 0.0), rtol=0, atol=1e-13)
+        found, np.where(since >= 0.0, 0.5 * gain * np.exp(-since / tau), 0.0), rtol=0, atol=1e-13)
 
 
 def test_transient_of_uneven_stamps():
     t = np.cumsum(np.random.default_rng(3).exponential(DT, 400))
     found = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=step_at(100),
                   t=t)
-    since = t - t[99]
+    since = t - t[100]
     np.testing.assert_allclose(
-        found, np.where(since > 0.0, 0.4 * np.exp(-since / 0.03), 0.0), rtol=0, atol=1e-13)
+        found, np.where(since >= 0.0, 0.4 * np.exp(-since / 0.03), 0.0), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize('delay, later', [(0.02, 20), (0.001, 1), (0.1, 100), (0.0205, 21)])

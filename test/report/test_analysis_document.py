@@ -119,6 +119,15 @@ def test_a_safe_throttle_that_did_fall_below_the_limit_is_contradicted(analysis,
     assert 'yet the voltage' not in ' '.join(answer(above))
 
 
+@pytest.mark.parametrize('limit, warned', [(3.3, True), (13.2, False)])
+def test_a_limit_per_cell_for_a_whole_pack_is_questioned(limit, warned):
+    """15 V with a sag are four cells; 3.3 V may be meant for each of them."""
+    flown = recording(1, ((0.0, 0.1), (0.5, 0.3), (0.9, 0.5)), sag=-2.0)
+    flown = replace(flown, voltage=10.9 + flown.voltage)
+    said = ' '.join(answer(analyze(flown, brownout_voltage=limit)))
+    assert ('0.82 V per cell if this is a pack of 4 cells' in said) == warned
+
+
 @pytest.mark.parametrize('factor, lower', [(0.9, False), (2.0, True)])
 def test_a_sigma_above_that_of_every_level_is_explained(analysis, factor, lower):
     """What follows a change of load counts as noise in the recording, not at steady throttle."""

@@ -83,10 +83,10 @@ def test_transient_is_that_of_the_figure():
     # and 80 mV, are within 5 mV of that exponential.
     t, voltage, throttle = drawn('transient', 400.0, seed=3)
     assert float(throttle.max()) == pytest.approx(0.2, rel=1e-6)
-    # A throttle holds from the stamp before: the decay counts from there.
-    last = np.flatnonzero(np.diff(throttle) < 0.0)
-    assert last.size == 40 and np.allclose(t[last + 1] % 10.0, 6.0)
-    path = np.mean([voltage[k:k + 60] - 5.0 for k in last], axis=0)
+    # A throttle holds until the next stamp: the decay counts from its own.
+    first = np.flatnonzero(np.diff(throttle) < 0.0) + 1
+    assert first.size == 40 and np.allclose(t[first] % 10.0, 6.0)
+    path = np.mean([voltage[k:k + 60] - 5.0 for k in first], axis=0)
     expected = -0.368 * np.exp(-63.0 * np.arange(60) / 1000.0)
     error = 9.38e-3 / math.sqrt(40.0)
     assert np.abs(path - expected).max() < 4.5 * error

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import CsvColumns
-from ou_monitor.simulation import constant, is_recording, PROFILES, read_profile, through
+from ou_monitor.simulation import (
+    constant, is_recording, plan, PROFILES, read_profile, through)
 import pytest
 
 
@@ -105,6 +106,13 @@ def test_a_csv_is_a_profile(tmp_path):
     one = tmp_path / 'one.csv'
     one.write_text('time_s,throttle\n0,0.7\n')
     assert at(read_profile(str(one)), 0.0, 10.0) == [0.7, 0.7]
+
+
+def test_points_set_the_length(tmp_path):
+    path = tmp_path / 'stick.csv'
+    path.write_text('time_s,throttle\n0,0.1\n5,0.45\n90,0.45\n')
+    assert [plan(throttle=text).duration for text in (str(path), '0:0.1,30:0.5', '0.4', 'flight')
+            ] == [90.0, 30.0, 120.0, 120.0]
 
 
 @pytest.mark.parametrize('text, words', [

@@ -131,9 +131,10 @@ class LoadTransient(Term):
         slow: dict[int, float] = {}
         times = np.empty(0)
         values = np.empty(0)
+        last = math.nan
 
         def effect(s: Segment) -> None:
-            nonlocal times, values
+            nonlocal times, values, last
             throttle = s.throttle
             if self.delay > 0.0:
                 # Use the throttle `delay` ago; at the beginning, the first throttle.
@@ -146,10 +147,13 @@ class LoadTransient(Term):
                 keep = max(int(then[-1]), 0)
                 times, values = times[keep:], values[keep:]
             phi = np.exp(-s.step / self.tau)
+            # Each throttle holds until the next one.
+            held = np.concatenate((throttle[:1] if math.isnan(last) else [last], throttle[:-1]))
+            last = float(throttle[-1])
 
             def change(power: int) -> FloatArray:
-                value = throttle ** power
-                low = first_order(phi, (1.0 - phi) * value, slow.get(power, float(value[0])))
+                value, before = throttle ** power, held ** power
+                low = first_order(phi, (1.0 - phi) * before, slow.get(power, float(before[0])))
                 slow[power] = float(low[-1])
                 return value - low
 

@@ -37,7 +37,9 @@ class Segment:
     # Time since the previous sample, s; infinite before the first, which has the stationary law;
     # shape (n,).
     step: FloatArray
-    throttle: FloatArray  # 0..1, each value for the time since the previous stamp; shape (n,)
+    # 0..1; shape (n,).  The mean responds to each value from its stamp to the next one; noise
+    # depends on it from the previous stamp to its own.
+    throttle: FloatArray
     origin: float  # Stamp of the first sample of the recording, s
     # Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample; shape (n,).
     alpha: FloatArray
