@@ -282,6 +282,7 @@ def _ou_words(ou: OuFacts, whole: OuFacts | None = None) -> str:
     if ou.status == 'not_visible':
         if not ou.var_inf_below:
             return f'none: no noise in {window}'
-        return (f'not visible in {window}; if slower than {number(1e3 * ou.tau_below_s)} ms, it '
-                f'is below {number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
+        return (f'not visible in {window}: faster than '
+                f'{number(1e3 * ou.tau_below_s)} ms, or below '
+                f'{number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
     return 'unknown: the recording is too short for it'

@@ -47,7 +47,7 @@ _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# Maximum time of a fit, s, for which the mean is chosen again after each cause.
+# If the best fit of a round takes less time than this, s, the response to load is chosen again.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
 # maximum lines added in one round.
@@ -286,7 +286,7 @@ def _refit(fitter: Fitter, found: Composite) -> Composite:
 
 def _leaves_range(fitter: Fitter, model: Composite) -> bool:
     """Return whether sigma follows `LoadDependentNoise` and a simulation leaves the range."""
-    # All simulations must stay within the recorded range (share 1): the model is still Gaussian.
+    # Quantile 1, the largest: without heavy tails even the farthest simulation should stay inside.
     follows = any(isinstance(term, LoadDependentNoise) and term.on_sigma for term in model.terms)
     return follows and outside_range(fitter.samples, model.terms, 1.0) > 0.0
 

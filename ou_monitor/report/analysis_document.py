@@ -66,8 +66,8 @@ def answer(analysis: Analysis) -> list[str]:
     curves = analysis.by_throttle
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
-        f'At the end, safe up to {100.0 * curves.budget:.0f} % throttle for {curves.horizon:g} s'
-        f'{_fall_within_budget(analysis)}.'
+        f'At the end of the recording, {100.0 * curves.budget:.0f} % throttle is safe for '
+        f'{curves.horizon:g} s{_fall_within_budget(analysis)}.'
         if curves.budget > 0.0 else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
         f'{_why_no_throttle(analysis)}.']
@@ -148,8 +148,8 @@ def _fall_within_budget(analysis: Analysis) -> str:
         first, last = np.searchsorted(recording.t, [begin - 1.0, begin + dip.seconds])
         top = float(np.fmax.reduce(recording.throttle[first:last + 1], initial=0.0))
         if top <= analysis.by_throttle.budget + 0.01:
-            return (f'; yet the voltage was below {dips.limit_v:g} V at {100.0 * top:.0f} % '
-                    f'throttle, at {number(dip.begin_s, 4)} s')
+            return (f'; but at {number(dip.begin_s, 4)} s the voltage was below '
+                    f'{dips.limit_v:g} V at {100.0 * top:.0f} % throttle')
     return ''
 
 

@@ -115,7 +115,7 @@ class SupplyLoad:
         return self.status is LoadStatus.KNOWN
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag after 1 s, V; mostly the prior unless `known`; NaN: unknown."""
+        """Return the sag after `hold`, V; unless `known`, it is close to the prior, or NaN."""
         return self._read(throttle, self._sag)
 
     def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:

@@ -47,7 +47,7 @@ SHARE_WORDS = dict.fromkeys(('%', 'percent', 'pct', 'prozent'), '%')
 OTHER_WORDS = frozenset(('', *('- sequence w wh ah mah hz khz rpm 1/min ° deg °c degc °f m m/s '
                                'km/h g kg n nm ohm mohm').split()))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
-# Unit -> its size in V, A, s or 1; the last letter shows the quantity.
+# Unit -> its size in V, A, s or 1.  Units with the same last letter measure the same quantity.
 SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
           'mV': 1e-3, 'kV': 1e3, 'uV': 1e-6, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3,
           'uA': 1e-6, '%': 0.01}
