@@ -65,7 +65,7 @@ def test_strict_where_there_is_no_ros(tmp_path):
 
 
 @pytest.mark.parametrize('script', SHELL, ids=lambda path: path.name)
-def test_shell_syntax(script):
+def test_scripts_are_valid_bash(script):
     """Bash can read the script, and runs it directly unless it is sourced."""
     done = subprocess.run(['bash', '-n', script], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, '')

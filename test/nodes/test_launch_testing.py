@@ -45,5 +45,5 @@ class TestNodes(unittest.TestCase):
 class TestEnd(unittest.TestCase):
     """When they have ended."""
 
-    def test_status(self, proc_info):
+    def test_nodes_ended_with_status_0(self, proc_info):
         assertExitCodes(proc_info)

@@ -220,7 +220,7 @@ def test_any_schema_any_message(rnd, data):
 @pytest.mark.parametrize('field', ['s', 'd', 'e', 'u', 'u[1]', 'n.x', 'n', 'a', 'a[0].x', 'a[1].x',
                                    'f', 'f[1]', 'f[2]'])
 @pytest.mark.parametrize('rate', [None, 10.0])
-def test_cases_that_are_easily_missed(field, rate):
+def test_empty_arrays_and_unequal_shapes_are_read(field, rate):
     """Empty arrays are not aligned; equal sizes can hide unequal shapes."""
     text = ('string s\nstring t\nfloat64[] d\nuint8 e\nuint8[] u\nN n\nN[] a\nfloat32[] f\n'
             + 80 * '=' + '\nMSG: p/N\nfloat64 x\n')

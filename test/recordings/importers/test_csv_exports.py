@@ -1191,7 +1191,7 @@ def test_a_time_with_dots_is_no_date(minute, tmp_path):
 
 
 @pytest.mark.parametrize('names', ['时间,电压,油门', '时间 (s),电压 (V),油门'])
-def test_chinese_names(names, tmp_path):
+def test_chinese_column_names_are_read(names, tmp_path):
     """Windows writes them as GBK, which no Western name resembles."""
     rows = ''.join(f'{k / 100},12.{k % 7},0.{k % 5}\n' for k in range(60))
     found = read_recording(written(tmp_path, f'{names}\n{rows}'.encode('gbk')))
