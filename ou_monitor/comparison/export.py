@@ -95,6 +95,10 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is for a constant load, {n.usual_sag:.3g} V: throttle does not '
                      'change it')
+    if target != 'px4' and n.sag:
+        notes.append('the resistance is that of the settled fall at '
+                     f'{"the usual load" if target == "gazebo" else "full throttle"}; analyze '
+                     'gives the one after 1 s')
     notes += [f'load_sag is as at the start: in the model, it grows by {t.growth:.3g} V/s at '
               'full throttle' for t in model.terms
               if target != 'px4' and isinstance(t, LoadSag) and t.growth]
