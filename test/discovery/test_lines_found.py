@@ -19,7 +19,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import HeavyTails
 from ou_monitor.model.terms.slow import SecondRelaxation
-from ou_monitor.model.terms.tones import Resonance, Tone
+from ou_monitor.model.terms.tones import Resonance, ThrottleTone, Tone
 from ou_monitor.records import NAN, Recording
 from project import needs_recordings, REAL, recorded
 import pytest
@@ -142,3 +142,20 @@ def test_a_relaxation_is_seen_neither_within_a_step_nor_beyond_the_end(alpha, re
     gaussian = evaluate(samples, (RAIL,))
     whole = Composite((RAIL,), ({},), gaussian, gaussian.z, gaussian.density, 3, 0.0)
     assert SecondRelaxation(alpha, 0.1).holds(Fitter(samples).view(whole)) is relaxes
+
+
+@pytest.mark.parametrize('idle, slope', [(33.0, 60.0), (120.0, -70.0)])
+def test_a_weak_line_that_follows_throttle_is_found(idle, slope):
+    """60 nats in 40 s: under the noise of each second, above it in all of them together."""
+    rng, n, rate = np.random.default_rng(4), 12000, 300.0
+    t = np.arange(n) / rate
+    throttle = 0.5 + 0.15 * np.sin(1.9 * t) + 0.2 * np.sin(0.7 * t + 1.0)
+    rail = OU(60.0, 0.3, 15.0)
+    step = 0.3 * math.sqrt((1.0 - math.exp(-2.0 * 60.0 / rate)) / 120.0)
+    phi, turn = math.exp(-60.0 / rate), 2.0 * math.pi * (idle + 0.5 * slope) / rate
+    gain = abs(1.0 - phi * np.exp(-1j * turn))
+    line = ThrottleTone(step / gain * math.sqrt(4.0 * 60.0 / n), idle, slope, 0.3, 0.0)
+    found = discover(Recording(t, SupplyModel((rail, line)).simulate(t, rng, throttle), throttle))
+    assert [cause.name for cause in found.causes] == ['throttle_tone']
+    term = found.causes[0].term
+    assert (term.idle, term.slope) == pytest.approx((idle, slope), abs=1.5)

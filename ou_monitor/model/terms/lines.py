@@ -115,9 +115,10 @@ def order_lines(view: View) -> list[tuple[float, float]]:
     if view.throttle is None:
         return []
     z, u = view.z[view.train], view.throttle[view.train]
-    found = sorted((line for length in _lengths(view.rate)
-                    for line in _hough(z, u, view.rate, length)[:_MOST]),
-                   key=lambda line: -line.rise)
+    # Lines that throttle determines exactly show in longer segments, in all of the recording.
+    found = sorted([line for length in _lengths(view.rate)
+                    for line in _hough(z, u, view.rate, length)[:_MOST]]
+                   + _unwound(view.z, view.throttle, view.rate), key=lambda line: -line.rise)
     return [_refined(z, u, view.rate, line.idle, line.slope, view.rate / (2.0 * line.length))
             for line in found[:_MOST]]
 
@@ -190,6 +191,39 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         best.append(_Line(rise if mean > 1.0 else 0.0, k * width, float(slope), length))
     best.sort(key=lambda line: -line.rise)
     return best
+
+
+def _unwound(z: FloatArray, u: FloatArray, rate: float) -> list[_Line]:
+    """Return the strongest lines in segments of 1 s, in which their phase follows throttle."""
+    length = round(_UNWOUND * rate)
+    count = z.size // max(length, 1)
+    moves = np.cumsum(u - u.mean())[:count * length].reshape(count, length) / rate
+    if count < 8 or not np.ptp(u) > 0.02:
+        return []
+    # A line moves by half a bin in the segment where throttle moves most.
+    step = 0.5 / float(np.percentile(np.ptp(moves, axis=1), 90.0))
+    # A negative slope is that of the mirrored line, at negative frequencies.
+    slopes = np.arange(0.0, _REACH * rate, step)
+    if slopes.size * z.size > _DEAREST:
+        return []
+    back = np.exp(-2j * math.pi * step * moves)
+    wave = z[:count * length].reshape(count, length).astype(np.complex128)
+    found = []
+    for slope in slopes.tolist():
+        power = (np.abs(np.fft.fft(wave, 2 * length, axis=1)) ** 2).mean(axis=0) / length
+        k = int(np.argmax(power))
+        mean = float(power[k])
+        rise = count * (mean - 1.0 - math.log(mean)) if mean > 1.0 else 0.0
+        centre = float(np.fft.fftfreq(2 * length, 1.0 / rate)[k])
+        slope = math.copysign(slope, centre)
+        found.append(_Line(rise, abs(centre) - slope * float(u.mean()), slope, length))
+        wave *= back
+    found.sort(key=lambda line: -line.rise)
+    return found[:_MOST]
+
+
+# Length of these segments, s; maximum of slopes times samples, about 1 s of processor time.
+_UNWOUND, _DEAREST = 1.0, 3e7
 
 
 def _refined(z: FloatArray, u: FloatArray, rate: float, idle: float, slope: float, width: float
