@@ -197,11 +197,11 @@ def _unwound(z: FloatArray, u: FloatArray, rate: float) -> list[_Line]:
     """Return the strongest lines in segments of 1 s, in which their phase follows throttle."""
     length = round(_UNWOUND * rate)
     count = z.size // max(length, 1)
-    moves = np.cumsum(u - u.mean())[:count * length].reshape(count, length) / rate
-    if count < 8 or not np.ptp(u) > 0.02:
+    if length < 8 or count < 8 or np.ptp(u) < 0.02:
         return []
+    moves = np.cumsum(u - u.mean())[:count * length].reshape(count, length) / rate
     # A line moves by half a bin in the segment where throttle moves most.
-    step = 0.5 / float(np.percentile(np.ptp(moves, axis=1), 90.0))
+    step = 0.5 / max(float(np.percentile(np.ptp(moves, axis=1), 90.0)), 1e-6)
     # A negative slope is that of the mirrored line, at negative frequencies.
     slopes = np.arange(0.0, _REACH * rate, step)
     if slopes.size * z.size > _DEAREST:
