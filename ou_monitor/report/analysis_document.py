@@ -127,9 +127,9 @@ def _budget(analysis: Analysis) -> str:
     words = (f'{100.0 * curves.budget:.0f} % throttle if held at the end of the recording: the '
              f'risk {what} stays under {100.0 * curves.limit:g} %')
     beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
-              if u > curves.budget and p >= 2.0 * curves.limit]
+              if u > curves.budget and p > curves.limit]
     if beyond:
-        u, p = beyond[0]
+        u, p = next((one for one in beyond if one[1] >= 2.0 * curves.limit), beyond[-1])
         words += f'; at {100.0 * u:.0f} % it is {percent(p)}'
     elif curves.budget < 1.0:
         words += '; higher throttle was not flown' + (

@@ -148,9 +148,11 @@ def _disagreement(finding: Finding, seen: Overview | None) -> str:
         return ''
     # The fit under Relaxation removes load, its lags and lines, but no other process with memory.
     inside = dict.fromkeys(
-        both_names(term.NAME) for term, se in zip(finding.model.terms, finding.se)
-        if term.ROLE is Role.BLOCK or (term.NAME == RegimeSwitching.NAME and abs(
-            term.values()['level']) > Z95 * se['level']))
+        both_names(term.NAME) for term, se in zip(finding.model.terms[1:], finding.se[1:])
+        if term.ROLE is Role.BLOCK
+        or (term.ROLE is Role.MEAN and term.FAMILY not in ('load', 'slow', 'line'))
+        or (term.NAME == RegimeSwitching.NAME
+            and abs(term.values()['level']) > Z95 * se['level']))
     return (f' Its alpha disagrees with the one under Relaxation ({number(supply.alpha)} 1/s, '
             f'from the last {number(supply.window_s)} s): ' + (
                 f'that value also contains {" and ".join(inside)}, which the model separates.'

@@ -73,9 +73,10 @@ def fleet_document(fleet: Fleet) -> Document:
         Section('Duplicates, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
         Section('Vehicles', [
             vehicles,
-            Text('Lowest voltage and total dips of all flights. sigma and alpha: medians as '
-                 'measured; "per flight": drift at the common throttle. A star marks what stands '
-                 'out.', legend=True), lambda: _strips(fleet)]
+            Text('Lowest voltage and total dips of all flights.' + (
+                ' sigma and alpha: medians as measured; "per flight": drift at the common '
+                'throttle. A star marks what stands out.' if {*VEHICLE_HEADS[4:]}.intersection(
+                    vehicles.heads) else ''), legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
                  Section('Sigma over throttle', _over_throttle(fleet), folded=True),

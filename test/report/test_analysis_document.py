@@ -102,6 +102,15 @@ def test_a_missing_budget_states_its_cause(analysis, level, last, words):
     assert safe.endswith('within 5 s is 0.3')
 
 
+def test_a_throttle_just_beyond_the_budget_counts_as_flown(analysis):
+    """Its risk is below twice the limit, so it was called not flown."""
+    curves = analysis.by_throttle
+    risk = np.where(curves.throttle < 1.0, 0.001, 0.015)
+    near = replace(analysis, by_throttle=replace(
+        curves, voltage=3.0, budget=0.95, limit=0.01, risk=risk))
+    assert '; at 100 % it is 1.5 %' in dict(facts(near))['Safe up to']
+
+
 @pytest.mark.parametrize('budget, warned', [(1.0, True), (0.05, False)])
 def test_a_safe_throttle_that_did_fall_below_the_limit_is_contradicted(analysis, budget, warned):
     """The risk is a model's; the flight itself has the last word."""
