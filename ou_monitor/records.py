@@ -326,9 +326,8 @@ class Estimate:
     u0_se : float
         Standard error of u0, V.
     sag : float
-        Slope of the mean against throttle at the present throttle, V per unit
-        throttle (negative when the supply sags); NaN when throttle did not
-        move.
+        Fall of the mean per unit of throttle at the present throttle, V,
+        positive when the supply sags; NaN when throttle did not move.
     voltage : float
         Newest voltage, V.
     throttle : float

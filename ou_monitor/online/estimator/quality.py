@@ -176,13 +176,13 @@ def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> li
 
 
 def _level(fit: WindowFit, throttle: float, moves: bool) -> tuple[float, float]:
-    """Return the mean at the present throttle, V, and its slope, V per unit throttle."""
+    """Return the mean at the present throttle, V, and its fall, V per unit throttle."""
     if not moves or math.isnan(throttle):
         return float(fit.level[0]), NAN
     shift = (load_at(throttle) - fit.level[1:5]) @ fit.beta[:4]
     # d(mean)/d(throttle), at a steady throttle.
     slope = fit.beta[0] + 2.0 * throttle * fit.beta[1] + fit.beta[2] + fit.beta[3]
-    return float(fit.level[0] + shift), float(slope)
+    return float(fit.level[0] + shift), -float(slope)
 
 
 def load_at(throttle: float) -> FloatArray:

@@ -135,7 +135,7 @@ def test_throttle_steps_do_not_become_noise(lag):
         base.append(estimate(T, y, np.full(N, 0.2)))
         e = estimate(T, y - 0.6 * felt, throttle)
         found.append(e)
-        slopes.append((e.sag + 0.6, e.u0 - (5.0 - 0.6 * throttle[-1])))
+        slopes.append((e.sag - 0.6, e.u0 - (5.0 - 0.6 * throttle[-1])))
     ratio = np.sqrt((errors(found) ** 2).mean(axis=0) / (errors(base) ** 2).mean(axis=0))
     assert (ratio < 1.3).all(), dict(zip(NAMES, ratio))
     # The level at the present throttle: 2 Var_inf / (alpha T) of each half, 16 mV.
@@ -154,7 +154,7 @@ def test_a_curved_sag_is_taken_out_of_the_mean():
     for y in paths(rng, 40, N):
         found.append(estimate(T, y - 0.3 * throttle - 0.8 * throttle ** 2, throttle))
     assert np.abs(errors(found).mean(axis=0)).max() < 0.1
-    expected = -0.3 - 1.6 * throttle[-1]
+    expected = 0.3 + 1.6 * throttle[-1]
     # Four levels of 0.5 s, each known to 30 mV or so per window, 5 mV over 40.
     assert np.mean([e.sag for e in found]) == pytest.approx(expected, abs=0.15)
 
