@@ -469,12 +469,17 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
                   partial(as_data, found, source, taken), 'rows', facts)
 
 
+# Time at the end of a recording from which its level is taken, s.
+_RECENT = 10.0
+
+
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
             risk: float) -> tuple[Flight, SupplyFacts, Callable[..., float] | None]:
     """Return flight, facts, and a function for the risk at the end (full and level in V)."""
     from ou_monitor.analysis.noise import remainder, without_wild
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
+    from ou_monitor.online.load.supply_load import Basis
     from ou_monitor.online.settings import MonitorSettings
     from ou_monitor.paper.design import Flight
 
@@ -508,7 +513,13 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
             risks = np.minimum(risks, over_throttle(1.0, noise, rise))
         return float(np.exp(np.interp(throttle, np.linspace(0.0, 1.0, risks.size), risks)))
 
-    return Flight(load.level, full, cells, facts.sag.throttle, facts.sag.sag_v, facts.sag.se_v,
+    level_now = load.level
+    if load.basis is Basis.CURRENT:
+        # That level is without any current; a flight needs the one without throttle.
+        last = recording.t > recording.t[-1] - _RECENT
+        level_now = float(np.nanmedian(recording.voltage[last] + np.interp(
+            recording.throttle[last], facts.sag.throttle, facts.sag.sag_v)))
+    return Flight(level_now, full, cells, facts.sag.throttle, facts.sag.sag_v, facts.sag.se_v,
                   facts.noise.rms_v, facts.noise.steady_rms_v, facts.noise.flown,
                   facts.resistance.ohm, facts.ou.alpha, facts.ou.var_inf), facts, (
                       risk_at if monitor else None)

@@ -249,6 +249,17 @@ def test_an_argument_of_a_wrong_type_is_named(call, words):
         call()
 
 
+def test_a_design_starts_from_the_voltage_without_throttle():
+    """A robot draws 40 A at rest: 13 V less 0.8 V, and 1.2 V more at full throttle."""
+    rng, t = np.random.default_rng(3), np.arange(6000) / 50.0
+    throttle = np.clip(0.5 + 0.5 * np.sin(0.9 * t) + 0.1 * np.sin(5.1 * t), 0.0, 1.0)
+    current = 40.0 + 60.0 * throttle + 0.5 * rng.standard_normal(t.size)
+    voltage = 13.0 - 0.02 * current + 0.01 * rng.standard_normal(t.size)
+    found = design(1.0, recording=Recording(t, voltage, throttle, current=current),
+                   voltage=10.0, network={'cells': 0})
+    assert found.rows[0].mean == pytest.approx(11.0, abs=0.15)
+
+
 def test_two_numbers_of_cells_are_refused():
     with pytest.raises(InputError, match='4 and 5 are both given'):
         design(0.5, cells=4, network={'cells': 5})
