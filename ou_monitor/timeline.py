@@ -12,8 +12,8 @@ Node, estimator and offline reading share these rules:
 Repeats: a voltage read at 100 Hz and logged at 1 kHz appears ten times, and the repeats would look
 like increments of zero.  They are recognised because the numbers of samples between two changes
 (gaps) are multiples of one period, which may be a fraction (3, 3, 4).  A coarse ADC also repeats
-values, but its gaps are irregular, or (ramp, square wave, ripple) all changes are of one code and
-the sums of two neighbouring gaps are equal.
+values.  Then the gaps are irregular, or (in a ramp, a square wave or ripple) all changes are by
+one code and each pair of neighbouring gaps has the same sum.
 
 Limits: repeats are recognised only with at least two samples per reading, and after 64 samples,
 which are then passed on again without repeats (`Batch.again`).  They are not recognised if the
@@ -330,8 +330,9 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     """
     Return a recording without wild readings and without the times when its supply was off.
 
-    Notes report both.  A supply is off below `OFF` of its usual voltage, and in adjacent readings
-    below `_ON`.  If it is low too often, or mostly between `OFF` and `_ON`, all readings are kept.
+    Notes report both.  A supply is off below `OFF` of its usual voltage; the outage includes
+    adjacent readings below `_ON`.  If the supply is low too often, or mostly between `OFF` and
+    `_ON`, all readings are kept.
     at_ends: leave out only the start and the end of the recording.
     """
     usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
@@ -421,8 +422,8 @@ TAIL, _ENOUGH, _LOOK = 1024, 64, 256
 _STRETCH = 20
 # Indices of samples, or a slice if all are meant.
 Picked = npt.NDArray[np.intp] | slice
-# Share of samples equal to the one before above which repeats are searched (a third or more if
-# there are repeats).
+# Repeats are searched if more than this share of the samples is equal to the previous sample.  If
+# there are repeats, the share is at least a third.
 _TIED = 0.25
 
 

@@ -378,7 +378,7 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 
 def _sag_error(samples: Readings, load: _Load) -> float:
-    """Return the relative error of the mean sag of two held-out parts."""
+    """Return the relative error of a sag averaged over two parts, from all held-out parts."""
     # In each held-out part, the voltage is regressed on the predicted path.  Temperature, wind and
     # simplifications of the load model make the slope differ from 1.  Parts in which the path
     # moves more have more weight.

@@ -72,7 +72,7 @@ _MOST_METADATA, _MOST_TABLES = 10_000_000, 3
 # Maximum size of a definition (usual: some kB) and of a name (DDS: 256 characters).
 _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
 # Maximum number of damaged places before the walk ends, of left-out topics that are named, and of
-# records in a chunk that are not messages (one schema and one channel for each number).
+# records in a chunk that are not messages (a schema and a channel for each of 65536 identifiers).
 _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
 # Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024

@@ -57,10 +57,11 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
 
 # `power_spread`: number of segments per 1 / linewidth, and minimum number of segments.
 _FINE, _ENOUGH = 4.0, 12
-# Maximum `power_spread` of a line of constant amplitude, and minimum of ringing; between 0.7 and
-# 0.85 the evidence decides.  In 60 simulated lines and 60 simulated ringings, with outliers: 60
-# lines and 10 ringings were below CONSTANT, 2 lines and 54 ringings above RINGING, if there were
-# 14 segments; with 33 segments, 60 and 2 were below, 0 and 60 above.
+# Limits of `power_spread`.  Above CONSTANT, a peak is not a line of constant amplitude; below
+# RINGING, it is not ringing.  Between 0.7 and 0.85 it can be either, and the evidence decides.
+# Simulations of 60 lines and 60 ringings, with outliers: with 14 segments, 60 lines and 10
+# ringings were below CONSTANT, and 2 lines and 54 ringings above RINGING; with 33 segments, 60
+# lines and 2 ringings were below CONSTANT, and 0 lines and 60 ringings above RINGING.
 CONSTANT, RINGING = 0.85, 0.7
 
 
@@ -115,7 +116,8 @@ def order_lines(view: View) -> list[tuple[float, float]]:
     if view.throttle is None:
         return []
     z, u = view.z[view.train], view.throttle[view.train]
-    # Lines that throttle determines exactly show in longer segments, in all of the recording.
+    # `_unwound` searches the whole recording, in longer segments: if a line follows throttle
+    # exactly, it stays sharp in them.
     found = sorted([line for length in _lengths(view.rate)
                     for line in _hough(z, u, view.rate, length)[:_MOST]]
                    + _unwound(view.z, view.throttle, view.rate), key=lambda line: -line.rise)
@@ -134,8 +136,8 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     return top, trials
 
 
-# Share of the examined lines that are independent, because neighbours share most bins.  With this
-# share, 1 of 120 simulated flights of white noise exceeded the 95 % point.
+# Share of the examined lines that count as independent: small, because neighbours share most
+# bins.  With this share, 1 of 120 simulated flights of white noise exceeded the 95 % point.
 _INDEPENDENT = 0.02
 # Maximum slope, in sampling rates: from idle to full throttle a line may fold once and return.
 _REACH = 1.0
@@ -200,7 +202,8 @@ def _unwound(z: FloatArray, u: FloatArray, rate: float) -> list[_Line]:
     if length < 8 or count < 8 or np.ptp(u) < 0.02:
         return []
     moves = np.cumsum(u - u.mean())[:count * length].reshape(count, length) / rate
-    # A line moves by half a bin in the segment where throttle moves most.
+    # From one slope to the next, the phase changes by half a cycle within a segment in which
+    # throttle moves much (90 % quantile).
     step = 0.5 / max(float(np.percentile(np.ptp(moves, axis=1), 90.0)), 1e-6)
     # A negative slope is that of the mirrored line, at negative frequencies.
     slopes = np.arange(0.0, _REACH * rate, step)

@@ -37,8 +37,8 @@ class Segment:
     # Time since the previous sample, s; infinite before the first, which has the stationary law;
     # shape (n,).
     step: FloatArray
-    # 0..1; shape (n,).  The mean responds to each value from its stamp to the next one; noise
-    # depends on it from the previous stamp to its own.
+    # 0..1; shape (n,).  For the mean, a value applies from its own stamp to the next stamp; for
+    # the noise, it applies from the previous stamp to its own stamp.
     throttle: FloatArray
     origin: float  # Stamp of the first sample of the recording, s
     # Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample; shape (n,).

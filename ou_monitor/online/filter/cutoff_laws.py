@@ -3,8 +3,8 @@ Laws from sigma to the wanted cutoff, each with its derivation.
 
 The supply U is an Ornstein-Uhlenbeck process of intensity sigma and rate
 alpha, and the signal contains `coupling` times its deviation.  With
-w = 2 pi fc, the output variance is then (coupling sigma)^2 V(w), by the
-integral of |H(iw)|^2 / (alpha^2 + w^2) over the frequencies:
+w = 2 pi fc, the output variance is then (coupling sigma)^2 V(w).  V is the integral
+of |H(iq)|^2 / (alpha^2 + q^2) over all angular frequencies q, divided by 2 pi:
 
     low-pass, order 1     V = w / (2 alpha (w + alpha))
     low-pass, order 2     V = w (sqrt2 w + alpha) / (2 sqrt2 alpha (w^2 + sqrt2 w alpha + alpha^2))
@@ -90,7 +90,7 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """Return `relative_cutoff` of the filter at this sampling interval, s; Hz."""
+    """Return `relative_cutoff`, Hz, for independent samples every `interval` seconds."""
     angle, noise, power = _table(mode, order)
     log = math.log(TWO_PI * fmax * interval)
     before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (

@@ -351,7 +351,7 @@ class BrownoutFlag:
                 return level, (f'{words}, has not fallen below {leave:.2g} '
                                f'(brownout.leave x brownout.{word})')
         if above:
-            # The present level is below the one that waits, which was not returned above.
+            # All levels in `above` are delayed, so they are higher than the present level.
             return self._level, (f'risk {max(risk, soon):.2g} waits for brownout.delay '
                                  f'({s.brownout_delay:g} s)')
         return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'

@@ -100,7 +100,8 @@ _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
     'loopIteration': {'time': (0.0, 'us', math.nan), 'rccommand[3]': (0.0, 'us', math.nan), **{
         f'{name}{end}': (0.01, unit, math.nan) for name, unit in (
             ('vbat', '0.01 V'), ('amperage', '0.01 A')) for end in ('', 'latest')}},
-    '': {name: (scale, f'{unit} by MAVLink, {unknown:g} is unknown: --unit V for V and A', unknown)
+    '': {name: (scale, f'{unit} by MAVLink, {unknown:g} means unknown; for V and A: --unit V',
+                unknown)
          for name, scale, unit, unknown in (
              ('voltage_battery', 1e-3, 'mV', 65535.0), ('voltages[0]', 1e-3, 'mV', 65535.0),
              ('vcc', 1e-3, 'mV', 0.0), ('vservo', 1e-3, 'mV', 0.0),
@@ -339,7 +340,7 @@ def _rest_of_group(form: Form, quantity: str, column: FileColumn, wanted: CsvCol
 
 
 def _mean_of_motors(values: list[FloatArray]) -> FloatArray:
-    """Average the motors that run at any time, as for a ULog: a stopped one counts as 0."""
+    """Average the motors that ever run; while one is stopped, it counts as 0, as for a ULog."""
     used = np.array([one for one in values if np.isfinite(one).any()] or values[:1])
     return np.where(np.isfinite(used).any(axis=0), np.nansum(used, axis=0) / len(used), np.nan)
 
@@ -456,7 +457,8 @@ def _finest(form: Form, first: int) -> int:
     whole = all(re.search(r':\d\d:\d\d$', cell) for cell in form.cells(first))
     finer = [k for k in named if whole and form.units[k] in TIME_WORDS and any(
         '.' in cell and is_number(cell) for cell in form.cells(k))]
-    # A new start falls to the first time or below it; a late line does not, and is sorted later.
+    # If a clock starts anew, it falls back to the first time or below.  A late line falls less,
+    # and is sorted later.
     t = _times(form, first)
     anew = bool(((np.diff(t)[1:] < 0.0) & (t[2:] <= t[0])).any()) if t.size else False
     return next((k for k in (*finer, first, *named) if (
@@ -488,7 +490,8 @@ def _nameless_columns(form: Form) -> list[int]:
         form.rows) and all(map(is_value, form.cells(k)))]
     if not form.line:
         return filled
-    # Beside the time a general name, or beside a throttle or current a level in decimals.
+    # A column with a general name, if the time is the only other column; or a steady column with
+    # decimals, if there is a throttle or current, or if its name fits a supply.
     others = {*_choose(form, logs.THROTTLE), *_choose(form, logs.CURRENT)}
     return [k for k in {*filled[1:]} - others if not form.units[k] and (
         form.width == 2 and re.fullmatch(_VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])
@@ -506,7 +509,7 @@ def _range_of(form: Form, place: int) -> float:
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
-    """Return the only column, or several if the first of them varies least; else none."""
+    """Return the only column; without a header, all that vary if the first varies least."""
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
         return places if len(places) == 1 else []
     # Constant columns are not compared.
@@ -657,9 +660,11 @@ def _read(path: Path, form: Form, time: FileColumn, places: list[int],
 
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
                       taken: Iterable[int]) -> None:
-    """Raise InputError if a column not taken names several series that share one of values."""
-    # Stamps rise within each series.  Several are likely if stamps go back or repeat, if values
-    # have general names, or if levels or ids alternate; random loads do so in up to 2/3 of rows.
+    """Raise InputError if an unused column shows that `values` holds several series."""
+    # Stamps rise within each series.  Several series are likely if stamps go back or repeat, if
+    # the column of values has a general name, or if the series alternate and have ids or differ
+    # in level.  Levels of a random load alternate too, in up to 2/3 of the rows, so levels count
+    # only if they alternate in more than 3/4.
     known = np.isfinite(t) & np.isfinite(values)
     stamps, levels = t[known], values[known]
     overlap = np.count_nonzero(
