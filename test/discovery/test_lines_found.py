@@ -10,6 +10,7 @@ from ou_monitor.analysis.levels import LevelSegment, LoadLevel
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
+from ou_monitor.discovery import fitting
 from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.named import _in_doubt, _SURE
 from ou_monitor.model.supply import SupplyModel
@@ -43,6 +44,19 @@ def test_only_a_sure_line_is_never_withdrawn(amplitude, stays):
     error = standard_errors(samples, whole, slice(0, samples.n))[1]['amplitude']
     assert (amplitude > _SURE * error) == stays
     assert _in_doubt(samples, whole, ['tone'], [0]) == ([] if stays else [0])
+
+
+def test_errors_of_a_singular_filter_are_infinite(monkeypatch):
+    """Half of a recorded flight led to such a model, and the whole command ended."""
+    samples = Samples(T, voltage(Tone(0.02, 13.0, 0.5, 0.0)), None)
+    whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
+
+    def singular(*_, **__):
+        raise ValueError('the covariance of the model is singular or not finite')
+
+    monkeypatch.setattr(fitting, 'whitened', singular)
+    assert standard_errors(samples, whole, slice(0, samples.n))[1] == {
+        'amplitude': math.inf, 'phase': math.inf}
 
 
 def test_ringing_that_stands_out_on_both_sides_is_never_withdrawn():
