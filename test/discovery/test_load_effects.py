@@ -50,6 +50,15 @@ def test_the_fall_is_measured_and_dips_are_counted():
     assert dips.observed_se == pytest.approx(dips.observed / math.sqrt(13.0))
 
 
+def test_dips_that_the_lowest_load_avoids_are_made_by_load():
+    """A sag of 0.4 V below noise of 0.6 V: the smaller part, without which none is a dip."""
+    samples, sag = flown(LoadSag(0.4, 0.0)), LoadSag(0.4, 0.0)
+    voltage = samples.voltage.copy()
+    voltage[(U > 0.0) & (T % 5.0 > 0.2) & (T % 5.0 < 0.3)] -= 0.6
+    dips = dips_of(Samples(T, voltage, U), (REST,), (REST, sag))
+    assert 14.0 < dips.level < 14.4 and (dips.count, dips.made) == (13, 12)
+
+
 def test_without_a_response_to_load_there_is_no_effect():
     """Neither of a model without one, nor of a recording without load."""
     for samples, terms in ((flown(), (REST,)), (Samples(T, flown().voltage, None), (REST,))):
