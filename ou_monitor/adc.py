@@ -54,7 +54,7 @@ def number_of(path: Path) -> float:
 def write_attribute(path: Path, value: object) -> None:
     """Set an attribute."""
     try:
-        # Without O_CREAT: a missing attribute must be an error in an ordinary folder (tests), too.
+        # Without O_CREAT, so that a missing attribute is an error in a test's folder, too.
         handle = os.open(path, os.O_WRONLY | os.O_TRUNC)
         try:
             os.write(handle, f'{value}\n'.encode('ascii', 'replace'))

@@ -82,7 +82,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
         Brown-out limit, V; if `cells` is given, V per cell, by default 3.3.  Without either, the
-        limit in the log's header, else the default of the node.
+        limit in the log's header, else, for a 5 V rail, the default of the node.
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
@@ -371,10 +371,10 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     Raises
     ------
     InputError
-        When the recording has neither throttle nor current, or its voltage does not fit the number
-        of cells.
+        When the recording has neither throttle nor current or does not show its sag, or its
+        voltage does not fit the number of cells.
     ValueError
-        When a number is out of its range, or the recording does not show sag or noise.
+        When a number is out of its range, or the recording does not show its noise.
 
     Examples
     --------

@@ -1,9 +1,9 @@
 """
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-`SupplyMonitor` processes the recording as it would in flight, so that command and node agree; for
-this part, throttle need not be constant, and the limits of the monitor apply.  The risk is for the
-state at the end of the recording, and NaN at throttles 0.1 or more above the highest flown.
+`SupplyMonitor` processes the recording as it would in flight, so that command and node agree; this
+part needs no constant throttle, and the limits of the monitor apply.  The risk is for the state at
+the end of the recording, and NaN at throttles 0.1 or more above the highest flown.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """

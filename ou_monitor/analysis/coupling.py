@@ -209,10 +209,10 @@ def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
     if not 0.0 < low < high:
         raise InputError(
             f'the band {low:g}..{high:g} Hz is empty: the slower series has '
-            f'{min(grid.rates):.4g} Hz and is good up to {grid.usable:.4g} Hz')
+            f'{min(grid.rates):.4g} Hz and is usable up to {grid.usable:.4g} Hz')
     if high > grid.usable * (1.0 + 1e-3):
         raise InputError(f'the band ends at {high:g} Hz, but the slower series has '
-                         f'{min(grid.rates):.4g} Hz and is good up to {grid.usable:.4g} Hz')
+                         f'{min(grid.rates):.4g} Hz and is usable up to {grid.usable:.4g} Hz')
     return low, high
 
 

@@ -11,16 +11,16 @@ The process types are from Table 1 of the paper, which assigns them by eye.  Her
 (`ou_monitor.analysis.level_tests`), adjusted so that only one in a hundred recordings of
 stationary OU levels has any rejection.  The first rule that applies names the level:
 
-1. mean or intensity changes from block to block: 'quasi-stationary' (the
-   verdict also names the type apart from these changes);
+1. mean or intensity changes: 'quasi-stationary' (the verdict also names the type without them);
 2. isolated extreme innovations, or heavy tails: 'with impulses';
 3. not a normal distribution: 'not Gaussian';
 4. too few samples to detect heavy tails: 'undetermined';
-5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
-   faster than the sampling: 'Gaussian';
-6. lines carry most of the variance, or one relaxation does not leave
-   independent innovations, or a second one is detected: 'stationary stochastic';
-7. otherwise 'diffusion', or 'undetermined' without a usable fit.
+5. neighbours uncorrelated: 'Gaussian';
+6. lines carry most of the variance, or no relaxation is visible: 'stationary stochastic';
+7. no usable fit: 'undetermined';
+8. relaxation faster than the sampling, or more white noise than relaxation: 'Gaussian';
+9. one relaxation leaves correlated innovations, or a second one is detected: 'stationary
+   stochastic'; otherwise 'diffusion'.
 
 Limits: the power of the tests depends on the length of the level; impulses cannot be distinguished
 from an intensity that changes within a block.

@@ -3,7 +3,7 @@ Load levels: segments of a recording at constant throttle.
 
 A segment starts when throttle comes within the half width of a level, and ends when it is farther
 away than twice that, so that jitter of the stick does not split it.  The half width is
-`HALF_WIDTH`, or more if the stick jitters more.  A ramp through a throttle is not a segment.
+`HALF_WIDTH`, or more if the stick jitters more.  A ramp that passes a level is not a segment.
 Limits: throttle is a command, not a current, so two segments at one throttle can have different
 loads, and a segment need not be stationary; levels closer than the jitter are merged.
 """

@@ -136,9 +136,9 @@ RECORDING = Option(
 # Part of a recording to read.
 PART = (
     Option('--from', metavar='S', dest='start', type=TIME,
-           help='leave out earlier samples, s after the first message'),
+           help='leave out samples before this time, s after the first message'),
     Option('--to', metavar='S', dest='end', type=TIME,
-           help='leave out samples from here on, s after the first message'))
+           help='leave out samples from this time on, s after the first message'))
 # How a bag is read.
 TOPICS = (
     Option('--msg-config', metavar='NAME',
@@ -156,8 +156,8 @@ CSV = (
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
            help='unit of the time in a CSV (default: detected)'),
     Option('--throttle-unit', metavar='{1,%,us,LOW:HIGH}', type=ends,
-           help='unit of the throttle in a CSV: 0..1, percent, a pulse of 1000 to 2000 us, or '
-           'its ends, such as 364:1684 or --throttle-unit=-1024:1024 (default: detected)'),
+           help='unit of the throttle in a CSV: 0..1, percent, pulses of 1000 to 2000 us, or the '
+           'values at zero and full throttle, as --throttle-unit=-1024:1024 (default: detected)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',
@@ -364,7 +364,7 @@ _DESIGN = Command(
             '%(default)s, as for the throttle budget of analyze)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
-            help='throttle, 0..1 (default with --from: exceeded for 1 %% of the flight)'),
+            help='throttle, 0..1 (default with --from: the flight exceeds it 1 %% of the time)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      *limit('brown-out level, V (default: 3.3 V per cell on the bus; 4.5 V on a regulated rail of '
@@ -398,7 +398,7 @@ _DISCOVER = Command(
      Option('--save-model', metavar='FILE.yaml',
             help='write the extended model, for simulate --model and the estimator'),
      Option('--force', action='store_true',
-            help='overwrite files that exist already, and save the model even where it predicts '
+            help='overwrite files that exist already, and save the model even if it predicts '
                  'worse than the plain OU or its simulations leave the recorded range'),
      REPORT),
     ('flight.mcap --report causes.html', 'flight.bbl --save-model flight.yaml --force'))
@@ -422,7 +422,7 @@ _FLEET = Command(
             help='allow a scheduler on another machine without TLS'),
      Option('--vehicle-from', metavar='REGEX',
             help='regular expression whose first group finds the vehicle in the path, if the '
-            'metadata name none (default: the folder is the vehicle)'),
+            'metadata do not (default: the folder is the vehicle)'),
      Option('--discover', action='store_true',
             help='also search for causes; takes a few seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),

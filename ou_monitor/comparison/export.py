@@ -96,15 +96,15 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         notes.append(f'load_sag is for a constant load, {n.usual_sag:.3g} V: throttle does not '
                      'change it')
     if target != 'px4' and n.sag:
-        notes.append('the resistance is that of the settled fall at '
+        notes.append('the resistance is computed from the settled fall at '
                      f'{"the usual load" if target == "gazebo" else "full throttle"}; analyze '
-                     'gives the one after 1 s')
+                     'gives the resistance after 1 s')
     notes += [f'load_sag is as at the start: in the model, it grows by {t.growth:.3g} V/s at '
               'full throttle' for t in model.terms
               if target != 'px4' and isinstance(t, LoadSag) and t.growth]
     if target != 'px4' and math.isnan(n.stated):
         notes.append(f'the capacity, {_capacity(n, full_current):.3g} Ah, is estimated from the '
-                     'fall of the voltage: replace it by what the pack states')
+                     'fall of the voltage: replace it by the capacity printed on the pack')
     if recording is not None:
         notes += _explained_words(model, left, recording)
     return Export(text, tuple(notes), left)

@@ -149,7 +149,7 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _leans_up(below: FloatArray, codes: int, step: float) -> bool:
-    """Return whether the code above the fullest of the top codes is fuller than the one below."""
+    """Return whether, next to the fullest of the top codes, the higher code is the fuller one."""
     # Noise after clipping lowers as many readings as it raises.
     count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
     full = max(range(codes), key=lambda k: count[k])

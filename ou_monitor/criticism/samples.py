@@ -166,7 +166,7 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
     first = (n - size) // 2
     what = f'every {_nth(widest)} was used' if widest > 1 else 'all were used'
     return slice(first, first + size, widest), (
-        f'{n} samples: {what} of the {size / rate:.4g} s in the middle ({rate / widest:.4g} Hz), '
+        f'{n} samples: of the {size / rate:.4g} s in the middle, {what} ({rate / widest:.4g} Hz), '
         'because the rail relaxes too fast for a lower rate; effects slower than that segment '
         'are not detected.')
 

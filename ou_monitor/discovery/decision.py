@@ -32,7 +32,7 @@ TIE = 3.0
 # A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
 # (test/hidden), further terms gained at most 0.8 % if the form was right.
 FORM, CURVE = 0.005, 0.1
-# Evidence per sample that is enough for a correction of a form in any case, nats: one-step errors
+# Evidence per sample with which a term that only corrects a form is accepted too, nats: errors
 # shrink by 2 %.  An unmodelled lag of that size biases alpha, or imitates a latent cause.
 VISIBLE = 0.02
 # Minimum number of relaxation times in a recording; with fewer, the OU counts as a trend.  At this

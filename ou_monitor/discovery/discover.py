@@ -290,9 +290,9 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     """Return notes: withdrawn causes, and undecided questions."""
     notes = [named.failure] if named.failure else []
     for name in dict.fromkeys(dropped):
-        notes.append(f"'{name}' fitted, but did not explain its statistics: withdrawn."
+        notes.append(f"'{name}' was fitted, but did not explain its statistics: withdrawn."
                      if name in named.dropped else
-                     f"'{name}' fitted, but did not improve predictions of held-out samples, "
+                     f"'{name}' was fitted, but did not improve predictions of held-out samples, "
                      'or its size is not determined: left out.')
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))
@@ -319,7 +319,7 @@ _STEP = 1e-4
 
 
 def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = ()) -> Verdict:
-    """Return the verdict for a number of causes, by remaining statistics and doubts."""
+    """Return the verdict, from the number of causes, remaining statistics and doubts."""
     if causes == 0:
         return Verdict.UNEXPLAINED if remaining else Verdict.NO_EFFECT
     return Verdict.PARTLY_EXPLAINED if remaining or doubts else Verdict.EXPLAINED

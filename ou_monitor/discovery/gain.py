@@ -72,8 +72,8 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
     known = None if laws else model
     found = [_fitted(samples, kept, known)]
-    # A model with further states may be fitted to a part of the samples only, which may not show
-    # what the `ou` has to explain instead.  Without these states, all samples are fitted.
+    # A model with further states may be fitted to only a part of the samples.  Effects that the
+    # `ou` must explain in their place may be missing there.  So also fit all, without the states.
     light = _complete(term for term in kept if term.ROLE is not Role.BLOCK)
     if len(light) < len(kept):
         found.append(_fitted(samples, light, known))

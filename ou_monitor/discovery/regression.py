@@ -95,7 +95,7 @@ def mean_response(samples: Samples, composite: Composite, view: View,
 
 
 def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
-    """Return a response with refined time constants and delays; so far they are from a list."""
+    """Return a response whose time constants and delays, chosen from a list, are refined."""
     # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
     # which would be mistaken for a slow OU.
     terms, worth = found.terms, found.worth

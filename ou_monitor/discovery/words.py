@@ -254,7 +254,7 @@ def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.
 def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
     """Return why a gain cannot be measured, and which recording would measure it."""
     few = (f'only {scored} samples can be scored, fewer than {fewest}' if scored
-           else 'no part of the recording determines its parameters for the others')
+           else 'no part of the recording can be scored with parameters from the other parts')
     if throttle:
         return (f'{few}: the parts cover different ranges of throttle. A recording that covers '
                 'its whole range of throttle more than once would measure it.')

@@ -28,7 +28,7 @@ from ou_monitor.timeline import check_size
 class Options:
     """Options of the analysis, the same for every recording of the fleet."""
 
-    levels: tuple[float, ...] | None = None  # Throttles of the load levels; None: found in each
+    levels: tuple[float, ...] | None = None  # Throttles of the load levels; None: detect them
     window: float = 2.0  # Window of the sliding estimate, s
     # Voltage, V, and horizon, s, of the risk; a voltage of NaN leaves the risk unknown.
     brownout_voltage: float = NAN

@@ -95,7 +95,7 @@ def _real(path: Path) -> Path:
 
 
 def _candidates(root: Path, left_out: Path | None, closed: list[str]) -> Iterator[Path]:
-    """Yield the files and bags in a folder; describe folders that cannot be entered in closed."""
+    """Yield the files and bags in a folder; add the folders that cannot be read to `closed`."""
     for folder, inner, names in _walk(root, lambda error: closed.append(
             f"'{error.filename}' ({error.strerror})")):
         here = Path(folder)

@@ -73,8 +73,8 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
         (differing, 'metadata and --vehicle-from name different vehicles; the metadata are used.'),
         (unmatched, '--vehicle-from finds no vehicle in the path; these recordings are not '
          'compared.'),
-        (mixed, 'the metadata name no vehicle, though other recordings in the folder name one; '
-         'these recordings are not compared. --vehicle-from can name their vehicle by the path.')
+        (mixed, 'the metadata lack the vehicle, which other recordings in the folder state; these '
+         'recordings are not compared. --vehicle-from can take the vehicle from the path.')
     ) if paths)]
     both = {v.name for v in found.values() if v.named_by == METADATA} & {
         v.name for v in found.values() if v.named_by != METADATA and v.name}

@@ -229,7 +229,7 @@ class LoadStart:
         names = [f.name for f in fields(cls)]
         for name in values:
             if name not in names:
-                raise ValueError(f"the load has no entry '{name}': {', '.join(names)}")
+                raise ValueError(f"the load has no entry '{name}', only {', '.join(names)}")
         missing = [name for name in names[:-_OPTIONAL] if name not in values]
         if missing:
             raise ValueError(f"the load lacks '{missing[0]}'")

@@ -102,7 +102,7 @@ class SupplyModel:
         """
         Draw a recording, V (t in s, rising).
 
-        throttle: 0..1, shape (n,), each held until the next stamp; or one number.
+        throttle: 0..1, shape (n,), or one number; `Segment` states when each value applies.
         """
         stamps = np.asarray(t, dtype=np.float64)
         load = None if throttle is None else np.broadcast_to(

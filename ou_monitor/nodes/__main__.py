@@ -49,7 +49,7 @@ With {LIFECYCLE} it waits to be configured and activated (ros2 lifecycle set).
 
 adaptive_filter = Executable('ou_adaptive_filter', 'adaptive_filter_node', 'AdaptiveFilterNode',
                              rf"""
-Executable `adaptive_filter`: a low-pass whose cutoff follows sigma.
+Executable `adaptive_filter`: notches that follow the motors, a low-pass that follows sigma.
 
 ros2 run ou_monitor adaptive_filter --ros-args -r input:=/imu -r sigma:=ou_estimator/sigma \
     -r state:=ou_estimator/state

@@ -299,7 +299,7 @@ class EstimatorNode(MonitorNode):
             **{name: value if value > 0.0 else None for name, value in values.items()}},
             self._keep_working)
         self._monitor.set_model(self._models.use(path))
-        return f'{path}: saved the load of this flight; {self._models.terms} are unchanged.'
+        return f'{path}: saved the load model of this flight; unchanged: {self._models.terms}.'
 
     # -- reports out
 
@@ -349,8 +349,8 @@ class EstimatorNode(MonitorNode):
         """Return the notes that are added to any summary."""
         notes = []
         if self._stream.thin > 1:
-            notes.append(f'Overload: one of {self._stream.thin} samples enters the estimate; the '
-                         'floor checks all.')
+            notes.append(f'Overload: one of {self._stream.thin} samples enters the estimate; all '
+                         'are checked against the floor.')
         notes += self.fault_notes
         if 'voltage' in self._inputs:
             notes += self._watched.notes(self._topic)

@@ -258,7 +258,7 @@ class LatchFile:
             self._replace(json.dumps(record).encode())
         except (OSError, ValueError) as error:
             self.problem = (f'state_file {self.path} cannot be written: {_words(error)}; until '
-                            'then, a latched flag will not survive a restart')
+                            'it can, a latched flag will not survive a restart')
             return
         self._written, self.problem = record, ''
 

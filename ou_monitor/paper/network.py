@@ -100,8 +100,8 @@ class PowerNetwork:
     regulator_voltage: float = _part(5.0, 'V', zero=True)
     regulator_resistance: float = _part(0.03, 'Ohm')
     # The regulator rejects changes of its input slower than this, Hz, and multiplies faster ones
-    # by `line_gain`; None: by the open-loop gain of a buck converter, its duty regulator_voltage /
-    # battery_voltage (Erickson & Maksimovic, Fundamentals of Power Electronics, section 8.2).
+    # by `line_gain`.  If that is None, it is the open-loop gain of a buck converter, the duty
+    # regulator_voltage / battery_voltage (Erickson & Maksimovic, Power Electronics, section 8.2).
     regulator_bandwidth: float = _part(20e3, 'Hz')
     regulator_efficiency: float = _part(0.9)  # Output power over input power, 0..1.
     line_gain: float | None = _part(None, zero=True)

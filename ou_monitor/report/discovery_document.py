@@ -157,7 +157,7 @@ def _disagreement(finding: Finding, seen: Overview | None) -> str:
             f'from the last {number(supply.window_s)} s): ' + (
                 f'that value also contains {" and ".join(inside)}, which the model separates.'
                 if inside else
-                'the model also fits errors of its response to load: prefer the latter value.'
+                'the model also fits errors of its response to load: trust the value there.'
                 if finding.remaining else
                 'no statistic contradicts the model, so the relaxation seems to change.'))
 

@@ -190,7 +190,7 @@ class _BoundedLoader(yaml.SafeLoader):
             return super().construct_object(node, deep)
         except (ValueError, OverflowError, TypeError, LookupError, AttributeError):
             # PyYAML passes on Python's errors for a value that does not fit its tag.
-            self._refuse('a value does not exist or does not fit its tag', node)
+            self._refuse('a value is impossible or does not fit its tag', node)
 
     def _count(self, nodes: int, at: Any) -> None:
         self._nodes += nodes

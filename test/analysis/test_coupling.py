@@ -176,7 +176,7 @@ T = np.arange(5000) / RATE
     (T, np.ones(T.size), {}, 'does not change'),
     (T[:600], np.sin(99 * T[:600]), {}, 'at least 16 segments'),
     (T[::50], np.sin(9 * T[::50]), {}, 'the slower series has 10 Hz'),
-    (T, np.sin(99 * T), {'band': (20.0, 200.0)}, 'good up to 125 Hz'),
+    (T, np.sin(99 * T), {'band': (20.0, 200.0)}, 'usable up to 125 Hz'),
     (T, np.sin(99 * T), {'band': (20.0, 20.1)}, 'widen it'),
     (T, np.sin(99 * T), {'level': 0.0}, 'between 0 and 1'),
 ])

@@ -144,7 +144,7 @@ def test_the_page_says_what_the_text_says(table, tmp_path, capsys):
     (['--signal', 'gyro_q'], 'gyro_'), (['--signal', 'time_s'], 'not a signal'),
     (['--signal', ''], 'empty'), (['--signal', 'gyro_x', '--band', '5'], 'LOW,HIGH'),
     (['--signal', 'gyro_x', '--band', '9,5'], 'LOW < HIGH'),
-    (['--signal', 'gyro_x', '--band', '5,90'], 'good up to'),
+    (['--signal', 'gyro_x', '--band', '5,90'], 'usable up to'),
     (['--signal', 'gyro_x', '--level', '2'], '--level'), ([], '--signal'),
     (['--signal', 'gyro_x', '--json', '/nowhere/x.json'], '/nowhere'),
 ])

@@ -263,7 +263,7 @@ def test_ambiguous_vehicles_are_not_pooled():
     found, notes = assign({Path('/f/a.mcap'): 'SN1', Path('/f/b.mcap'): 'SN2',
                            Path('/f/c.mcap'): ''})
     assert [v.name for v in found.values()] == ['SN1', 'SN2', '']
-    assert any("'/f/c.mcap': the metadata name no vehicle" in note for note in notes)
+    assert any("'/f/c.mcap': the metadata lack the vehicle" in note for note in notes)
     found, notes = assign({Path('/f/a.mcap'): 'uav1', Path('/uav1/b.mcap'): ''})
     assert any('check that it is one vehicle' in note for note in notes)
 

@@ -67,7 +67,7 @@ def blamed(error: BaseException) -> tuple[str, ...]:
 
 
 def withdraw(error: BaseException) -> bool:
-    """Remove the installed causes that raised an error, else all; return False if none exist."""
+    """Remove installed causes: those that raised the error, or all; False: none is installed."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)

@@ -225,7 +225,7 @@ def _unwound(z: FloatArray, u: FloatArray, rate: float) -> list[_Line]:
     return found[:_MOST]
 
 
-# Length of these segments, s; maximum of slopes times samples, about 1 s of processor time.
+# Length of these segments, s; maximum product of slopes and samples: 1 s of processor time.
 _UNWOUND, _DEAREST = 1.0, 3e7
 
 

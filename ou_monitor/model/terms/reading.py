@@ -113,7 +113,7 @@ class LopsidedNoise(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit the scores if they are mostly white noise, with a free scale."""
+        """Fit scores that are mostly white noise; their scale is free."""
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         found, paid = cls._best_fit(view)
         # Other causes describe heavy tails without asymmetry.
@@ -317,7 +317,7 @@ class ClockJitter(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit hidden errors of the stamps; they are visible, as longer steps add more noise."""
+        """Fit the unknown errors of the stamps, which show because longer steps add more noise."""
         return cls._best_fit(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:

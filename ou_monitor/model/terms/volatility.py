@@ -31,7 +31,7 @@ class Volatility(Term):
     MEANING: ClassVar[str] = 'sigma changes slowly at random, independent of throttle.'
     REMEDY: ClassVar[str] = 'Use an estimator window much shorter than 1/rate.'
     SEPARATED_BY: ClassVar[str] = (
-        'a recording several times as long, with the temperature')
+        'a recording several times as long that includes the temperature')
 
     std: float = parameter('', 'standard deviation of ln sigma', 0.0)
     rate: float = parameter('1/s', 'relaxation rate of ln sigma', 0.0, above=True)

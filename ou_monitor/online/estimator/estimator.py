@@ -57,8 +57,8 @@ MIN_SAMPLES = 20
 # Minimum length of a run of evenly spaced readings (and longest lag of increments); share of
 # readings in such runs below which the window counts as uneven.
 _LAGS, _EVEN = 24, 0.5
-# Jitter of the stamps, in relaxation times, above which exact stamps are used, because an even
-# grid causes an error of the square of the jitter.
+# Jitter of the stamps, in relaxation times, above which exact stamps are used: the error of an
+# even grid grows with the square of the jitter.
 _JITTER = 0.1
 # Tolerance for rounded stamps at the edge of the window, as a share of the window.
 _ROUNDING = 1e-6

@@ -137,8 +137,8 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
     if name is None:
         found = default(log, quantity)
         if len(found) > 1:
-            raise InputError(f'{path} has several: {_names_of(found)}; choose with '
-                             f'{option.format(quantity)} NAME, {_LIST}')
+            raise InputError(f'{path} has several {quantity} series: {_names_of(found)}; choose '
+                             f'with {option.format(quantity)} NAME, {_LIST}')
         return found[0] if found else None
     held = [one for one in log.series if one.quantity in (quantity, ANY)]
     for one in held:

@@ -283,8 +283,8 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
                          'only ever rises: are the two columns swapped?')
     if logs.VOLTAGE in found and wanted.voltage is None and t.size and not np.nan_to_num(
             volts).any() and len(form.names) > 2:
-        raise InputError(f"{path}: '{found[logs.VOLTAGE].name}' is 0 or blank in every row, as "
-                         'without its sensor: name another column by --voltage-column')
+        raise InputError(f"{path}: '{found[logs.VOLTAGE].name}' is 0 or blank in every row, as if "
+                         'it had no sensor: name another column by --voltage-column')
     if logs.VOLTAGE in found and not series:
         _check_one_series(path, form, t, found[logs.VOLTAGE].name, volts, (*time.place, *places))
     t, words = stamps_of(path, t, raw, wanted, clock)

@@ -191,7 +191,7 @@ def in_si(path: Path, quantity: str, column: FileColumn, values: FloatArray, giv
             # 0: an output without pulses.
             values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
             if known.size and np.nanmedian(values) < 0.5 * THROTTLE_UNITS[unit][0]:
-                raise InputError(f"{path}: '{column.name}' is no pulse in {unit}: half of its "
+                raise InputError(f"{path}: '{column.name}' is not a pulse in {unit}: half of its "
                                  f'values are below {np.nanmedian(values):.4g}; give the unit '
                                  'that it has, or none')
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))

@@ -114,7 +114,7 @@ def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
     log = format_of(head)
     if log is not None and log.name not in (BAG, CSV):
         command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
-        return f'it is a log, {log.words}, not a recording: convert it first, with {command}'
+        return f'it is a log, {log.words}, not a bag: convert it first, with {command}'
     if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
         return TEXT
     return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')

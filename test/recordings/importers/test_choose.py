@@ -48,7 +48,7 @@ def test_values_that_no_message_holds_are_dropped():
 
 def test_two_throttles_of_one_rank_need_a_choice():
     log = Log('x', (series(), series('a', THROTTLE), series('b', THROTTLE)))
-    with pytest.raises(InputError, match='several: a .*b .*--throttle'):
+    with pytest.raises(InputError, match='several throttle series: a .*b .*--throttle'):
         choose(PATH, log)
 
 

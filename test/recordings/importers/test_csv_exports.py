@@ -836,7 +836,7 @@ def test_the_unit_of_a_throttle(tmp_path):
     # A duty below 0 runs a motor in reverse.
     duty = written(tmp_path, 't,U,duty [%]\n0,12,-50\n1,12,50\n', 'c.csv')
     np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
-    with pytest.raises(InputError, match='no pulse in us: half of its values are below'):
+    with pytest.raises(InputError, match='not a pulse in us: half of its values are below'):
         read_recording(percent, columns=CsvColumns(throttle_unit='us', current='none'))
 
 

@@ -61,7 +61,7 @@ def test_a_log_given_as_a_recording(tmp_path, name):
     """`analyze` reads it; `replay` asks to convert it first."""
     path = tmp_path / 'flight.log'
     path.write_bytes(made(name))
-    with pytest.raises(InputError, match='not a recording: convert it first') as refused:
+    with pytest.raises(InputError, match='not a bag: convert it first') as refused:
         BagReader(path)
     assert f'with ou-monitor convert {path} flight' in str(refused.value)
 
