@@ -160,9 +160,15 @@ def check_cells(full: float, cells: int) -> None:
 def doubtful_cells(full: float, cells: int) -> str:
     """Return a warning if this number of cells hardly fits the voltage at rest, V; else ''."""
     likely = cell_count(full)
-    return '' if not (0 < likely < cells and full / cells < _BEGINS) else (
-        f'{full:.4g} V at rest would be {full / cells:.3g} V per cell: the pack is damaged, or it '
-        f'has {counted(likely, "cell")}, not {cells}.')
+    low = 0 < likely < cells and full / cells < _PACK
+    return '' if not low or cells == _iron_cells(full) else (
+        f'{full:.4g} V at rest would be {full / cells:.3g} V per cell: the pack is empty or '
+        f'damaged, or it has {counted(likely, "cell")}, not {cells}.')
+
+
+def _iron_cells(full: float) -> int:
+    """Return the cells of a common LiFePO4 pack with this voltage at rest, V; 0 if none fits."""
+    return next((n for n in _IRON_CELLS if _IRON[0] <= full / n <= _IRON[1]), 0)
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:
@@ -256,11 +262,12 @@ def craft_line(craft: Craft) -> str:
                 + ('' if one.verdict == 'usual' else f' (usual: {low} to {high})'))
     if not found and (craft.measures or not craft.cells):
         return ''
-    iron = next((n for n in _IRON_CELLS if _IRON[0] <= craft.full_v / n <= _IRON[1]), 0)
+    iron = _iron_cells(craft.full_v)
     source = {'log': ' (from the log)', 'guessed': ' of LiPo (from the voltage)' + (
         f' or {iron} of LiFePO4' if iron > craft.cells else '')}.get(craft.cells_from, '')
-    # Without a comparison, the voltage alone does not tell a pack from a rail.
-    maybe = 'if it is a pack: ' if craft.cells_from == 'guessed' and not found else ''
+    # The voltage alone does not tell a pack from a rail: 12, 24, 36 and 48 V are 4 V per cell.
+    sags = any(one.name == 'sag' and one.verdict in ('usual', 'high') for one in craft.measures)
+    maybe = 'if it is a pack: ' if craft.cells_from == 'guessed' and not sags else ''
     return f'{maybe}{counted(craft.cells, "cell")}{source}, ' + ('; or '.join(
         f'class "{kind}": {"; ".join(words)}' for kind, words in found.items())
         or 'no class known to compare with')

@@ -62,13 +62,20 @@ def test_a_voltage_alone_does_not_make_a_pack():
     assert craft_line(craft_of(rail, facts)).startswith('if it is a pack: 6 cells of LiPo')
     assert craft_line(craft_of(rail, facts, 6)).startswith('6 cells, no class known')
     assert craft_line(craft_of(replace(rail, voltage=1e3 * rail.voltage), facts)) == ''
+    # Nor does a comparison of its noise, if the supply does not sag as a pack.
+    for sag, maybe in ((0.0, True), (1e-3, True), (0.8, False)):
+        one = flown(cells=6, sag=sag)
+        line = craft_line(craft_of(one, supply_facts(one)))
+        assert 'noise' in line and line.startswith('if it is a pack: 6 cells') == maybe
 
 
 @pytest.mark.parametrize('full, cells, doubt', [
-    (16.6, 6, 'has 4 cells, not 6'), (16.6, 5, ''), (16.6, 4, ''), (18.1, 6, ''), (2.9, 1, ''),
-    (13.0, 5, 'has 3 cells, not 5'), (5.3, 2, '')])
+    (16.6, 6, 'has 4 cells, not 6'), (16.6, 5, 'has 4 cells, not 5'), (16.6, 4, ''), (2.9, 1, ''),
+    (18.1, 6, 'has 5 cells, not 6'), (21.5, 6, ''), (13.0, 5, 'has 3 cells, not 5'), (5.3, 2, ''),
+    # Four full cells of LiFePO4 have as much as three of LiPo.
+    (13.2, 4, '')])
 def test_a_count_that_hardly_fits_is_doubted(full, cells, doubt):
-    """Below 3 V per cell at rest, where fewer cells would have a usual voltage."""
+    """Below 3.5 V per cell at rest, where fewer cells would have a usual voltage."""
     found = doubtful_cells(full, cells)
     assert doubt in found and bool(found) == bool(doubt)
 
