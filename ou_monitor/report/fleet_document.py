@@ -45,7 +45,7 @@ VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sigma, V/sqrt(s)', 
 # Maximum characters of a vehicle's name in a table.
 _NAME = 30
 # Heads of the table of recordings.
-LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s',
+LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'per cell, V', 'at, s', 'dips', 'below, s',
                 'resistance, mOhm', 'sag, V', 'at throttle')
 
 
@@ -482,9 +482,9 @@ def dips_of(rows: Sequence[Row]) -> tuple[int, float, int] | None:
 
 
 def worst(fleet: Fleet) -> list[Row]:
-    """Return the recordings by number of dips, most first, then by lowest voltage per cell."""
+    """Return the recordings by lowest voltage per cell."""
     return sorted((row for row in fleet.analysed if row['lowest'] is not None),
-                  key=lambda row: (-(row['dips'] or 0), _of_a_cell(row), row['path']))
+                  key=lambda row: (_of_a_cell(row), row['path']))
 
 
 def _of_a_cell(row: Row) -> float:
@@ -503,7 +503,8 @@ def sentences(fleet: Fleet) -> list[str]:
     elif not found[0]:
         text = f'No recording fell below {fleet.limit:g} V: the lowest was {lowest}'
     else:
-        most, (count, below, recordings) = rows[0], found
+        most = max(rows, key=lambda row: row['dips'] or 0)
+        count, below, recordings = found
         where = f'in {recordings} of {counted(len(rows), "recording")}'
         if recordings > 1 and most['dips'] > 1:
             where += f', most in {_name(most)}, {most["dips"]}'
@@ -519,7 +520,7 @@ def sentences(fleet: Fleet) -> list[str]:
 
 def _lowest_of(rows: Sequence[Row]) -> str:
     """Return the lowest voltage per cell in words, and where and when it was."""
-    low = min(rows, key=_of_a_cell)
+    low = rows[0]
     found = f'{number(low["lowest"], 4)} V'
     if low['cells'] and len({row['cells'] for row in rows}) > 1:
         found = f'{number(_of_a_cell(low), 4)} V per cell ({found}, {_cells(low)} cells)'
@@ -546,7 +547,8 @@ def lowest_table(fleet: Fleet, most: int = _WORST) -> Table:
     names = short_names(fleet.vehicles)
     return Table.of_known(LOWEST_HEADS, [
         [names.get(row['vehicle'], UNKNOWN), row['recording'], _cell(row['lowest'], 4),
-         _cell(row['lowest_at']), UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
+         _cell(_of_a_cell(row), 4) if row['cells'] else UNKNOWN, _cell(row['lowest_at']),
+         UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
          _cell(row['below_s'], 2), _cell(row['resistance'], factor=1e3), _cell(row['sag']),
          UNKNOWN if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']
         for row in worst(fleet)[:most]], left=[0, 1], most=_SHOWN)

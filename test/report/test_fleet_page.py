@@ -141,8 +141,19 @@ def test_packs_of_other_cells_are_compared_per_cell():
     """3.9 V of one cell are more than 13.2 V of four."""
     mixed = fleet([seen('a', 'quad', 13.2, None, cells=4), seen('b', 'micro', 3.9, None, cells=1)])
     assert [row['path'] for row in worst(mixed)] == ['a', 'b']
+    made = lowest_table(mixed)
+    assert made.heads[2:4] == ['lowest, V', 'per cell, V']
+    assert [row[3] for row in made.rows] == ['3.300', '3.900']
     assert fleet_document(mixed).headline.startswith(
         'The lowest voltage was 3.300 V per cell (13.20 V, 4 cells) at 12.0 s of a (quad).')
+
+
+def test_many_dips_do_not_go_before_a_lower_voltage():
+    rows = [seen('a', 'quad', 13.4, 9), seen('b', 'quad', 12.1, 1), seen('c', 'quad', 14.2, 0)]
+    known = replace(fleet(rows), limit=13.5)
+    made = lowest_table(known)
+    assert [row[made.heads.index('lowest, V')] for row in made.rows] == ['12.10', '13.40', '14.20']
+    assert 'most in a (quad), 9: the lowest was 12.10 V' in fleet_document(known).headline
 
 
 def test_long_names_are_cut_where_they_stay_apart():
