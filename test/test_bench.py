@@ -72,6 +72,18 @@ def test_a_design_of_a_flight_has_its_facts(tmp_path):
     assert result.supply.to_dict() == supply_facts(read_recording(SMALL), limit=3.3).to_dict()
 
 
+@pytest.mark.parametrize('limit', [15.0, 19.5, 21.5])
+def test_the_axis_of_the_plot_follows_the_risk(limit):
+    """Risks from 0 to 1: at most a third of the axis is neither risk nor allowed risk."""
+    found = design(0.4, voltage=limit)
+    (plot,) = found.plots().values()
+    low, high = np.log10(plot.y_range)
+    drawn = np.log10(np.concatenate([curve.y for curve in plot.curves]))
+    assert low < drawn.min() and drawn.max() < high
+    assert np.ptp(drawn) > (high - low) * 2.0 / 3.0
+    assert ('below 1e-09' in plot.curves[0].label) == (min(row.risk for row in found.rows) < 1e-9)
+
+
 def test_simulate_equals_the_command(tmp_path):
     bag, other = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
     assert main(['simulate', '--preset', 'flight_full', '--duration', '3', '--seed', '4',

@@ -59,10 +59,12 @@ def design_document(result: Design, source: str, taken: str = '') -> Document:
 
 def _risk(result: Design) -> Plot:
     farads = np.array([row.capacitance for row in result.rows])
+    risk = np.array([row.risk for row in result.rows])
     plot = Plot('Risk by capacitance', 'bulk capacitance, uF', 'probability', log_x=True,
-                log_y=True).limits(y=(_LEAST_RISK, 2.0))
-    plot.line(1e6 * farads, np.maximum([row.risk for row in result.rows], _LEAST_RISK),
-              f'within {result.horizon:g} s', 0, 'thick')
+                log_y=True)
+    plot.line(1e6 * farads, np.maximum(risk, _LEAST_RISK), f'within {result.horizon:g} s'
+              + f' (below {_LEAST_RISK:g}: drawn there)' * bool((risk < _LEAST_RISK).any()),
+              0, 'thick')
     plot.level(1e6 * farads, result.target, 'allowed')
     return plot.mark(1e6 * result.present.capacitance, 'present')
 
