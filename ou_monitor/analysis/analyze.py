@@ -233,7 +233,7 @@ def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: 
 def as_data(analysis: Analysis) -> dict[str, Any]:
     """Return an analysis as plain data; NaN stands for unknown."""
     recording, sliding, curves = analysis.recording, analysis.sliding, analysis.by_throttle
-    duration = recording.duration
+    duration, begin = recording.duration, float(recording.t[0]) if recording.n else math.nan
     return {
         'recording': recording.name,
         'n': recording.n,
@@ -253,10 +253,10 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
             'voltage': curves.voltage, 'horizon_s': curves.horizon,
             'voltage_source': 'default' if analysis.brownout_default else 'given',
             'throttle_budget': curves.budget, 'budget_limit': curves.limit,
-            'budget_reason': curves.budget_reason, 't': curves.time},
+            'budget_reason': curves.budget_reason, 't': curves.time - begin},
         'sliding': {
             'window_s': sliding.window,
-            't': sliding.t,
+            't': sliding.t - begin,
             **{name: sliding.series(name) for name in (
                 'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0')},
             'status': [e.status.name for e in sliding.estimates],

@@ -1,5 +1,6 @@
 """The JSON of `analyze`: its numbers, and its keys, all of them documented."""
 
+from dataclasses import replace
 import math
 import re
 
@@ -31,6 +32,15 @@ def test_data_has_the_values_of_the_levels(analysis):
         assert len({len(level['psd'][name]) for name in level['psd']}) == 1
     lengths = {len(data['sliding'][name]) for name in ('t', 'alpha', 'sigma', 'status')}
     assert len(lengths) == 1 and lengths.pop() > 10
+
+
+def test_times_count_from_the_first_sample(analysis):
+    """As in `supply`, of a log whose stamps are dates."""
+    dated = replace(analysis.recording, t=analysis.recording.t + 1.7e9)
+    found, wanted = (as_data(analyze(one)) for one in (dated, analysis.recording))
+    assert 19.0 < found['brownout']['t'] < 20.0
+    assert found['brownout']['t'] == pytest.approx(wanted['brownout']['t'], abs=1e-3)
+    assert found['sliding']['t'] == pytest.approx(wanted['sliding']['t'], abs=1e-3)
 
 
 def names(value):
