@@ -383,10 +383,49 @@ def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: 
         current=None if recording.current is None else recording.current[which])
 
 
+def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
+    """Spread rows with equal stamps evenly, if their number per stamp is steady."""
+    # The first row of a stamp is at the stamp, unless rows are missing before it.
+    known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
+    stamps, change = t[known], np.diff(volts[known])
+    begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
+    step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
+    if step.size and (step < 0.0).all():
+        return spread(t[::-1], volts[::-1])[::-1]
+    if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
+        return t
+    usual, first = float(np.median(rows)), change[begin[1:] - 1]
+    # Leave the stamps if the voltage changes only where the stamp does (repeated rows), or always
+    # in one direction where it does (several series in turn).
+    if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
+            first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
+                np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
+                    1.0, _SURE / math.sqrt(first.size)):
+        return t
+    row, even = np.arange(float(known.size)), stamps.copy()
+    pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
+    for part in np.split(begin, pauses):
+        end = begin[begin > part[-1]].min(initial=known.size)
+        # The first and the last stamp may lack rows.
+        x = np.unique(np.append(part[1::_EVEN], part[-1]))
+        rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
+        here = row[part[0]:end]
+        even[part[0]:end] = np.interp(here, x, stamps[x]) + rate * (
+            np.minimum(here - x[0], 0.0) + np.maximum(here - x[-1], 0.0))
+    return t if (np.diff(even) <= 0.0).any() else np.where(
+        np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
+
+
 def ordered(recording: Recording) -> Recording:
     """Return a recording in the order of its stamps, each once; notes count dropped samples."""
     which, said = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE, ' V')
-    recording = part_of(recording, which, *said) if said else recording
+    if said and (even := spread(recording.t, recording.voltage)) is not recording.t:
+        recording = replace(recording, t=even, notes=(
+            *recording.notes, 'Equal stamps were spread evenly, a guess.'))
+        which, said = in_order(even, recording.voltage[:, None], MOST_VOLTAGE, ' V')
+    if said:
+        check_stamps(recording.name, recording.t, recording.voltage)
+        recording = part_of(recording, which, *said)
     check_throttle(recording.name, recording.throttle, recording.voltage)
     if recording.n > 1 and not LEAST_STEP <= (
             step := float(np.median(np.diff(recording.t)))) <= LONGEST_STEP:
@@ -414,6 +453,11 @@ MOST_THROTTLE = 2.0
 _REVERSE = 0.05
 # Maximum share of implausible throttles that are errors of single samples, not another unit.
 WILD = 0.05
+# To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
+# deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
+_LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
+# Maximum change by rounding, V; standard errors above which a mean change is significant.
+_ROUNDING, _SURE = 1e-6, 4.0
 # Maximum samples in a batch; NumPy's overhead per call is then negligible.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
@@ -451,6 +495,18 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
         f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
         'expected: state its ends (of a CSV: --throttle-unit LOW:HIGH; of a bag: unit_factor '
         'of a msg config), or divide percent by 100 in a Recording')
+
+
+def check_stamps(name: str, t: FloatArray, voltage: FloatArray) -> None:
+    """Refuse stamps too coarse for the voltage: dropping repeats would lose most readings."""
+    same = np.diff(t) == 0.0
+    # Only changes count: a logger may repeat a reading together with its stamp.
+    lost = np.count_nonzero(same & (np.abs(np.diff(voltage)) > 0.0))
+    if t.size >= _ENOUGH and lost > t.size - same.sum():
+        raise InputError(
+            f'{name}: {lost} changes of the voltage have no stamp of their own, as '
+            f'{counted(t.size)} share {counted(t.size - int(same.sum()), "stamp")}: give finer '
+            'stamps, or the interval of even samples (of a CSV: --sample-interval S)')
 
 
 def hold(values: FloatArray) -> FloatArray:
@@ -594,7 +650,8 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
                           Defect.NON_FINITE))
     stamps = t[good]
     if (steps := int(np.count_nonzero(stamps[1:] < stamps[:-1]))):
-        notes.append(Note(_late_words(steps, stamps), Defect.UNORDERED))
+        notes.append(Note(back_words(stamps) or f'{counted(steps)} came after a later stamp: '
+                          'sorted by stamp.', Defect.UNORDERED))
     places = np.flatnonzero(good)[np.argsort(stamps, kind='stable')]
     first = np.diff(t[places], prepend=-math.inf) > 0.0
     if not first.all():
@@ -603,12 +660,13 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     return places[first], notes
 
 
-def _late_words(steps: int, t: FloatArray) -> str:
-    """Return the note on samples out of order, with `steps` backward steps (t in s)."""
+def back_words(t: FloatArray) -> str:
+    """Return a note if the clock went back by a stretch (t in s), else ''."""
+    steps = int(np.count_nonzero(np.diff(t) < 0.0))
     ahead = np.maximum.accumulate(t) - t
     behind = int(np.count_nonzero(ahead))
-    if behind < _STRETCH * steps:
-        return f'{counted(steps)} came after a later stamp: sorted by stamp.'
+    if not steps or behind < _STRETCH * steps:
+        return ''
     times = 'once' if steps == 1 else f'{steps} times'
     return (f'The clock went back {times}, by {float(ahead.max()):.3g} s at most: '
             f'{counted(behind)} overlap earlier ones and were mixed with them; take a '

@@ -192,8 +192,9 @@ class BagReader:
                 self.counts[topic.name] = (
                     self.counts.get(topic.name, 0) + file.counts.get(key, 0))
 
-    def tables(self, topics: Iterable[str], end_ns: int | None = None) -> Iterator[Part]:
-        """Yield the messages as tables, some chunks at a time, up to `end_ns`, ns, or the end."""
+    def tables(self, topics: Iterable[str], end_ns: int | None = None, *, as_written: bool = False,
+               ) -> Iterator[Part]:
+        """Yield the messages as tables, chunks by time or as written, up to `end_ns`, ns."""
         wanted = set(topics)
         for topic in sorted(wanted):
             if topic not in self.topics:
@@ -205,7 +206,8 @@ class BagReader:
             spans += [(span, file) for span in file.spans
                       if (span.channels is None or span.channels & channels)
                       and (end_ns is None or span.start_ns < end_ns)]
-        spans.sort(key=lambda pair: pair[0].start_ns)
+        if not as_written:
+            spans.sort(key=lambda pair: pair[0].start_ns)
         total = sum(span.length for span, _ in spans)
         read = place = 0
         while place < len(spans):
@@ -263,7 +265,7 @@ def read_fields(
     broken: list[str] | None = None, beside: Mapping[str, FieldSpec] | None = None,
 ) -> dict[str, FieldColumn]:
     """
-    Return fields of a bag in the order of log times, at least to `end_ns`, ns.
+    Return fields of a bag in the order of the file, at least to `end_ns`, ns.
 
     `beside` names a second field to read from the same messages. For each message that cannot be
     decoded, `broken` gets an item, of which the first states the reason; if `broken` is None, such
@@ -281,7 +283,7 @@ def read_fields(
     readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}
     found: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
-    for part in bag.tables([spec.topic for spec in specs.values()], end_ns):
+    for part in bag.tables([spec.topic for spec in specs.values()], end_ns, as_written=True):
         for name, reader in readers.items():
             table = part.tables.get(reader.spec.topic)
             if table is not None:
@@ -295,7 +297,7 @@ def read_fields(
             raise InputError(
                 f"{bag.path} is damaged: it states {stated} messages of topic '{spec.topic}', "
                 f'{counts[name]} were found; use --partial to read the intact part')
-    return {name: joined_columns(parts).in_time_order() for name, parts in found.items()}
+    return {name: joined_columns(parts) for name, parts in found.items()}
 
 
 # Chunks are read together up to this size, bytes unpacked.

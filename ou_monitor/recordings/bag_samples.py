@@ -26,7 +26,7 @@ from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import clock_of, ThrottleHold
 from ou_monitor.text import counted, outside_words, part_words, printable, some
-from ou_monitor.timeline import BATCH, check_throttle
+from ou_monitor.timeline import back_words, BATCH, check_throttle
 
 
 def choose(
@@ -198,6 +198,15 @@ def read_bag(
     beside = {VOLTAGE: specs.pop(CURRENT)} if own else {}
     columns = read_fields(bag, specs, end_ns=last, progress=progress, beside=beside,
                           broken=broken if partial else None)
+    written = columns[VOLTAGE]
+    columns = {which: one.in_time_order() for which, one in columns.items()}
+    if columns[VOLTAGE] is not written:
+        # The order of log times hides that the clock went back.
+        part = (written.log_time >= first) & np.isfinite(written.stamp)
+        if words := back_words(written.stamp[
+                part if last is None else part & (written.log_time < last)]):
+            notes.append(Note(words, Defect.UNORDERED))
+    del written
     if last is not None:
         columns = {which: one.split(one.place(last))[0] for which, one in columns.items()}
     if broken:
@@ -293,7 +302,7 @@ def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
     stamped = Field('header', 'std_msgs/Header') in bag.definitions(kind)[short_name(kind)]
     spec = FieldSpec(topic, kind, field, nan='unknown',
                      stamp_field='header.stamp' if stamped else None)
-    column = read_fields(bag, {SIGNAL: spec})[SIGNAL]
+    column = read_fields(bag, {SIGNAL: spec})[SIGNAL].in_time_order()
     if not column.n:
         raise InputError(f"{path}: topic '{topic}' holds no message")
     unit = bag.about.get(f'{topic[1:]}_unit', UNKNOWN)

@@ -25,8 +25,8 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import clock_unit, MOST_STAMP, Recording
 from ou_monitor.text import outside_words, part_words
 from ou_monitor.timeline import (
-    check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
-    readings_of)
+    check_stamps, check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of,
+    plausible, readings_of)
 
 # Spacing, s, above which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
@@ -150,6 +150,8 @@ def tidy(raw: RawColumns) -> Recording:
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(unusable_words(name, notes))
+    if said:
+        check_stamps(name, raw.t, raw.voltage)
     # The unit is certain if the stamps are dates or the source states it.
     stated = clock_unit(t[0]) or 'time_unit' in raw.source
     # Cheap test first: with this median spacing, the mean is at least half of it.

@@ -94,6 +94,24 @@ def test_bytes_after_the_end_are_reported(sound, tmp_path):
         assert any('bytes follow' in note for note in found.notes)
 
 
+@pytest.mark.parametrize('way', ['zstd', 'unindexed', 'unchunked'])
+@pytest.mark.parametrize('back', [125, 250, 10**6])
+def test_a_clock_that_went_back(tmp_path, way, back):
+    """Log times start again in the middle: reported of a whole bag, and of one cut off."""
+    half = len(ROWS) // 2
+    rows = [*ROWS[:half], *((*r[:2], r[2] - back * MS, r[3]) for r in ROWS[half:])]
+    path = write(tmp_path / 'bag.mcap', rows, chunk_size=2000, **WAYS[way])
+    words = 'The clock went back once, by '
+    assert [note.startswith(words) for note in read(path).notes].count(True) == 1
+    if back != 250:
+        # One run alone.
+        assert not any(note.startswith(words) for note in read(path, end=0.1).notes)
+    assert not any('went back' in note for note in read(write(tmp_path / 'x.mcap', ROWS)).notes)
+    path.write_bytes(path.read_bytes()[:-len(MAGIC)])
+    refusal(lambda: read(path))
+    assert [note.startswith(words) for note in read(path, partial=True).notes].count(True) == 1
+
+
 @pytest.mark.parametrize('way', ['zstd', 'lz4', 'plain'])
 @pytest.mark.parametrize('spot', ['content', 'checksum'])
 def test_a_broken_chunk(tmp_path, way, spot):

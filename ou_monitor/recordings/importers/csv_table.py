@@ -29,13 +29,13 @@ from ou_monitor.recordings.importers.csv_cells import (
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.csv_units import (
-    FileColumn, in_si, lower_rows, PULSE_WORDS, spread, stamps_of, unwrapped)
+    FileColumn, in_si, lower_rows, PULSE_WORDS, stamps_of, unwrapped)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, RawColumns, Request, Series)
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline import hold, WILD
+from ou_monitor.timeline import hold, spread, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'

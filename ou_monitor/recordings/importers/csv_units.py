@@ -36,11 +36,6 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Number of values of a 32-bit counter; seconds per day.
 _COUNTS, _DAY = 2.0**32, 86400.0
-# To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
-# deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
-_LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
-# Maximum change by rounding, V; standard errors above which a mean change is significant.
-_ROUNDING, _SURE = 1e-6, 4.0
 # No craft's pack has more V: without a unit it is mV, and whole numbers above a tenth are counts.
 _MOST_VOLTS = 1000.0
 # A throttle without a unit is not taken for percent up to this maximum: levers give up to 5 V.
@@ -125,39 +120,6 @@ def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: F
         raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? Give --time-unit")
     return t, unit + words
-
-
-def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
-    """Spread rows with equal stamps evenly, if their number per stamp is steady."""
-    # The first row of a stamp is at the stamp, unless rows are missing before it.
-    known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
-    stamps, change = t[known], np.diff(volts[known])
-    begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
-    step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
-    if step.size and (step < 0.0).all():
-        return spread(t[::-1], volts[::-1])[::-1]
-    if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
-        return t
-    usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Leave the stamps if the voltage changes only where the stamp does (repeated rows), or always
-    # in one direction where it does (several series in turn).
-    if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
-            first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
-                np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
-                    1.0, _SURE / math.sqrt(first.size)):
-        return t
-    row, even = np.arange(float(known.size)), stamps.copy()
-    pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
-    for part in np.split(begin, pauses):
-        end = begin[begin > part[-1]].min(initial=known.size)
-        # The first and the last stamp may lack rows.
-        x = np.unique(np.append(part[1::_EVEN], part[-1]))
-        rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
-        here = row[part[0]:end]
-        even[part[0]:end] = np.interp(here, x, stamps[x]) + rate * (
-            np.minimum(here - x[0], 0.0) + np.maximum(here - x[-1], 0.0))
-    return t if (np.diff(even) <= 0.0).any() else np.where(
-        np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
 
 
 def lower_rows(t: FloatArray, volts: FloatArray) -> tuple[Picked, list[str]]:

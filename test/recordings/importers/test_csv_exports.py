@@ -732,15 +732,25 @@ def test_rows_that_share_a_stamp_are_spread(step, atol, tmp_path):
 
 
 @pytest.mark.parametrize('stamps, volts', [
-    # Rows repeated, and no steady number.
+    # Rows repeated; at an unsteady number, so that the value changes within a stamp.
     (np.arange(900) // 10, np.repeat(_RNG.normal(12.0, 0.1, 90), 10)),
-    (np.cumsum(_RNG.random(900) < 0.1), _RNG.normal(12.0, 0.1, 900))])
+    (np.cumsum(_RNG.random(900) < 0.1), np.repeat(_RNG.normal(12.0, 0.1, 90), 10))])
 def test_other_rows_that_share_a_stamp_are_dropped(stamps, volts, tmp_path):
     path = written(tmp_path, 'time,U\n' + ''.join(
         f'{clock(int(k), "%H:%M:%S", 1.0)},{u:.3f}\n' for k, u in zip(stamps, volts)))
     found = read_recording(path)
     assert found.n == np.unique(stamps).size and 'dropped: repeated stamp' in found.notes[-1]
     assert any('--sample-interval' in note for note in found.notes)
+
+
+def test_stamps_too_coarse_for_the_voltage_are_refused(tmp_path):
+    """A voltage that changes at most rows, an unsteady number of rows each second."""
+    stamps, volts = np.cumsum(_RNG.random(900) < 0.1), _RNG.normal(12.0, 0.1, 900)
+    path = written(tmp_path, 'time,U\n' + ''.join(
+        f'{clock(int(k), "%H:%M:%S", 1.0)},{u:.3f}\n' for k, u in zip(stamps, volts)))
+    with pytest.raises(InputError, match='900 samples share .* stamps: .*--sample-interval'):
+        read_recording(path)
+    assert read_recording(path, columns=CsvColumns(sample_interval=0.1)).n == 900
 
 
 @pytest.mark.parametrize('first', ['high', 'low'])
