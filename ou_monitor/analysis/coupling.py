@@ -9,7 +9,7 @@ supply and shows as a narrow line; a signal that *leads* the voltage because it 
 Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
 coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Segments
 are divided by the noise of the signal, which grows with throttle, so that a few loud ones do not
-dominate.  Repeated readings of the ADC are dropped: the steps between them come from the logger.
+dominate.  Repeated readings of the ADC are dropped: the steps that they make come from the logger.
 
 Cubic splines bring all series to the even grid of the fastest one.  If that is more than 8 times
 as fast as the slowest, the grid has 4 times the slowest rate, and series more than 1.5 times as
@@ -51,7 +51,7 @@ from scipy.special import chndtrinc
 
 # Lower end of the band, Hz; stick inputs and discharge are slower.
 LOWEST = 5.0
-# Longest and shortest segment, s; target number of segments.
+# Longest and shortest segment, s; target number of segments, not counting overlap.
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16  # Minimum number of segments
 LONGEST_LAG = 0.05  # Maximum lag that is searched, s

@@ -126,7 +126,7 @@ class Agreement:
     fall: Band | None
     recovery: Band | None
     rises: int
-    # Largest difference (KS) from the joint distribution of all simulations.
+    # Largest difference (KS) from the pooled distribution of the recording and all simulations.
     apart: Band
     seeds: int
     p_value: float  # Share of simulations and recording with at least the recording's score
@@ -406,7 +406,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
 
 
 def distance(one: Measures, pooled: FloatArray) -> float:
-    """Return the Kolmogorov-Smirnov distance between a voltage and all simulations."""
+    """Return the Kolmogorov-Smirnov distance of a voltage from a pooled distribution."""
     return float(np.max(np.abs(one.distribution - pooled)))
 
 
