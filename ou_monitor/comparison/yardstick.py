@@ -126,7 +126,7 @@ class Agreement:
     fall: Band | None
     recovery: Band | None
     rises: int
-    # Largest difference (KS) from the pooled distribution of the recording and all simulations.
+    # Largest difference (KS) from the joint distribution of all simulations.
     apart: Band
     seeds: int
     p_value: float  # Share of simulations and recording with at least the recording's score

@@ -313,7 +313,7 @@ class EstimatorNode(MonitorNode):
         report = self._monitor.report(
             self._source_clock.age(now), now, self._usable.age, again=again)
         if again:
-            # An estimate that takes 1 ms is a small load at 10 Hz; 100 ms delay the next estimate.
+            # At 10 Hz, an estimate of 1 ms costs little; one of 100 ms delays the next one.
             took = time.thread_time() - begin
             self._due = now + (took / SHARE if took > HEAVY else 0.0)
         self._console.flag(report.flag)
