@@ -133,14 +133,15 @@ def choose_response(fitter: Fitter, search: Search, start: Sequence[Term]) -> No
                   if term.ROLE is not Role.LAW and not decision.is_response(type(term))]
     laws = [term for term in composite.terms if term.ROLE is Role.LAW]
     gone = {term.NAME for term in own} - {term.NAME for term in response.terms}
-    if gone and is_trend(fitter.samples, composite):
-        return
-    fit = fitter.fit([*structural, *response.terms, *laws], composite)
+    # An `ou` that is itself a trend must not take the place of a drift.
+    kept = [term for term in own if term.NAME in gone and term.FAMILY == 'slow'] if is_trend(
+        fitter.samples, composite) else []
+    fit = fitter.fit([*structural, *response.terms, *kept, *laws], composite)
     if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
         return
     search.composite = fit
     before = [name for name in search.accepted if decision.is_response(catalogue()[name])]
-    names = [term.NAME for term in response.terms]
+    names = [term.NAME for term in (*response.terms, *kept)]
     search.accepted = [*names, *(name for name in search.accepted if name not in before)]
     for term, rivals in zip(response.terms, response.rivals, strict=True):
         search.rivals[term.NAME] = list(rivals)

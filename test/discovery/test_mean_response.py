@@ -181,3 +181,33 @@ def test_a_time_constant_between_those_of_the_list_is_measured(seed):
     (lag,) = [cause.term for cause in found.causes if isinstance(cause.term, LoadTransient)]
     assert lag.tau == pytest.approx(1.5, rel=0.07)
     assert not any(isinstance(cause.term, SecondRelaxation) for cause in found.causes)
+
+
+def test_a_slow_ou_does_not_replace_the_drift_of_a_flight():
+    # The first fit of this pack has an OU as slow as its discharge.  Without the drift, the search
+    # began again without a load, and named three delays.
+    rng, dt, n = np.random.default_rng(0), 0.02, 6000
+    t = dt * np.arange(n)
+
+    def ou(alpha, std):
+        keep = math.exp(-alpha * dt)
+        return lfilter([std * math.sqrt(1.0 - keep * keep)], [1.0, -keep],
+                       rng.standard_normal(n))
+
+    def low(x, tau):
+        gain = -math.expm1(-dt / tau)
+        return lfilter([gain], [1.0, gain - 1.0], x)
+
+    u, begin = np.clip(0.3 + ou(1.2, 0.07), 0.0, 1.0), 4.0
+    while begin < t[-1]:
+        stay = rng.uniform(0.3, 1.6)
+        u[(t >= begin) & (t < begin + stay)] = rng.uniform(0.7, 1.0)
+        begin += stay + rng.uniform(2.0, 6.0)
+    u[t < 2.0] = 0.0
+    load = low(np.append(u[0], u[:-1]), 0.04) ** 2
+    voltage = (24.8 - 3.0 * (load + 0.5 * low(load, 3.0)) - 0.03 * dt * np.cumsum(load)
+               + ou(2.0, 0.02) + 0.014 * rng.standard_normal(n))
+    causes = [cause.term for cause in discover(Recording(
+        name='pack', t=t, voltage=np.round(voltage, 2), throttle=u)).causes]
+    assert {'load_sag', 'drift'} <= {term.NAME for term in causes}
+    assert not any(term.delay for term in causes if term.NAME == 'load_transient')
