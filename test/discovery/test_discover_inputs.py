@@ -116,15 +116,12 @@ def short(what):
         return t[:99], v[:99], u[:99]
     if what == 'constant':
         return t, np.full(N, 5.0), u
-    if what == 'all NaN':
-        return t, np.full(N, math.nan), u
-    assert what == 'one stamp'
-    return np.zeros(N), v, u
+    assert what == 'all NaN'
+    return t, np.full(N, math.nan), u
 
 
 SHORT = {'two': '2 usable samples; at least 100', '99': '99 usable samples',
-         'constant': 'does not change at all', 'all NaN': '0 usable samples',
-         'one stamp': '1 usable sample;'}
+         'constant': 'does not change at all', 'all NaN': '0 usable samples'}
 
 
 @pytest.mark.parametrize('what', sorted(SHORT))
