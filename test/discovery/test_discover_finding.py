@@ -6,16 +6,18 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.discover import doubts, judge
+from ou_monitor.discovery.discover import discover, doubts, judge
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, LowDips, Verdict
 from ou_monitor.discovery.fitting import with_reach
 from ou_monitor.discovery.words import parameters
+from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.tones import Tone
+from ou_monitor.records import Recording
 import pytest
 
 OFF = Criticism('throttle', -20.0, 1.0, -3.7, 3.7, 0.0, 1.0)
@@ -125,3 +127,18 @@ def test_parameters_that_the_recording_cannot_determine_are_not_shown():
     assert 'alpha' not in parameters(slow, with_reach(slow, {'alpha': 1.0}, samples))
     near = LoadTransient(0.2, 16.0, 0.0)
     assert with_reach(near, {'tau': 1.0}, samples) == {'tau': 1.0}
+
+
+@pytest.mark.parametrize('even', [True, False])
+def test_a_periodic_load_is_no_random_switch(even):
+    # A load of 50 mV that is on for 0.3 s of each second, or for random times with that mean.
+    rng, rate, n = np.random.default_rng(1), 100.0, 6000
+    t = np.arange(n) / rate
+    turns = np.cumsum(np.tile([0.7, 0.3], 60) if even else
+                      rng.exponential(np.tile([0.7, 0.3], 60)))
+    on = np.searchsorted(turns, t, 'right') % 2
+    voltage = simulate(t, 20.0, 0.06, rng) + 5.0 - 0.05 * on
+    found = discover(Recording(name='rail', t=t, voltage=voltage))
+    assert [cause.name for cause in found.causes] == ['regime_switching']
+    assert ('as of a periodic load' in found.sentence) is even
+    assert not even or found.verdict is Verdict.PARTLY_EXPLAINED

@@ -543,6 +543,22 @@ class RegimeSwitching(Term):
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
+# Minimum number of complete stays in a state, and coefficient of variation below which they count
+# as even: exponential times of that number vary less with a probability of 1e-3.
+_STAYS, _EVEN = 10, 0.35
+
+
+def even_stays(path: FloatArray, at: FloatArray) -> float:
+    """Return the coefficient of variation of the stays in either state if even, else NaN."""
+    # path: a value between those of two states, shape (n,); at: times, s.
+    high = path > 0.5 * (path.min() + path.max())
+    stays = np.diff(at[1:][np.diff(high)])
+    found = [float(each.std() / each.mean()) for each in (stays[::2], stays[1::2])
+             if each.size >= _STAYS]
+    least = min(found, default=math.nan)
+    return least if least < _EVEN else math.nan
+
+
 def _counted_rates(before: FloatArray, step: float) -> FloatArray:
     """Return ln of the rates of leaving two states, by counting changes of the likelier state."""
     high = before[:, 1] > 0.5
