@@ -37,7 +37,6 @@ from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdr
 from ou_monitor.model.terms.load_response import LoadTransient, SHORTEST
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
-from ou_monitor.model.terms.regime_switching import even_stays, RegimeSwitching
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
 from ou_monitor.text import listed, number, Z95
@@ -127,7 +126,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     fall = load_fall(samples, whole.terms)
     against = doubts(whole.terms, dips, recording.duration,
                      float(np.median(samples.step[1:])), larger, fall,
-                     _even_stays(samples, whole)) if causes else ()
+                     _of_the_path(whole, samples.t)) if causes else ()
     verdict = judge(remaining, len(causes), against)
     done(1.0)
     found = Finding(
@@ -328,11 +327,10 @@ def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = (
 
 
 def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
-           larger: bool = False, fall: LoadFall = LoadFall(), even: float = math.nan
+           larger: bool = False, fall: LoadFall = LoadFall(), more: Sequence[str] = ()
            ) -> tuple[str, ...]:
     """Return objections to a model besides its statistics, in words (times in s)."""
-    # larger: whether its one-step errors are larger than those of the plain OU; even: variation
-    # of the stays in a state if they are too even for random switching, otherwise NaN.
+    # larger: whether its one-step errors are larger than those of the plain OU.
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
     if dips.worse:
         found.append(f'it dips below {dips.level:g} V {number(dips.extended)} times a minute; the '
@@ -341,22 +339,18 @@ def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
     if not fall.fits:
         found.append(f'its voltage falls by {number(fall.explained, 2)} V from low to high '
                      f'throttle; the readings fall by {number(fall.measured, 2)} V')
-    if math.isfinite(even):
-        found.append('its states change at random times; in the recording, the times in one of '
-                     f'them differ by only {100.0 * even:.0f} %, as of a periodic load')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
         found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')
-    return tuple(found)
+    return (*found, *more)
 
 
-def _even_stays(samples: Samples, model: Composite) -> float:
-    """Return the variation of stays in a state of two if they are even; otherwise NaN."""
-    if not any(isinstance(term, RegimeSwitching) and term.states == 2 for term in model.terms):
-        return math.nan
+def _of_the_path(model: Composite, t: FloatArray) -> list[str]:
+    """Return objections of the terms to the path of states or levels that was found."""
     path = model.offset if model.offset is not None else (
         None if model.events is None else np.log(model.events.power))
-    return math.nan if path is None else even_stays(path, samples.t)
+    said = [] if path is None else [term.objection(path, t) for term in model.terms]
+    return [one for one in said if one]
 
 
 def _at_ends(term: Term, duration: float, step: float) -> list[str]:

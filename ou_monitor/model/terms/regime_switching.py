@@ -340,6 +340,11 @@ def _fit_again(fit: LawFit, start: Start, view: View) -> Start:
 _MOST = 5_000_000
 
 
+# Minimum number of complete stays in a state, and coefficient of variation below which they count
+# as even: exponential times of that number vary less with a probability of 1e-3.
+_STAYS, _EVEN = 10, 0.35
+
+
 @dataclass(frozen=True)
 class RegimeSwitching(Term):
     """
@@ -433,6 +438,17 @@ class RegimeSwitching(Term):
         rates = rates_between(self.rate_up, self.rate_down, int(self.states))
         span = float(view.at[view.train.stop - 1] - view.at[0])
         return float(stationary_law(rates) @ rates.sum(axis=1)) * span >= _CHANGES
+
+    def objection(self, path: FloatArray, at: FloatArray) -> str:
+        """Return an objection if the stays in one of two states are too even to be random."""
+        high = path > 0.5 * (path.min() + path.max())
+        stays = np.diff(at[1:][np.diff(high)])
+        spread = [float(each.std() / each.mean()) for each in (stays[::2], stays[1::2])
+                  if each.size >= _STAYS]
+        least = min(spread, default=math.inf)
+        return '' if self.states > 2.0 or least > _EVEN else (
+            'its states change at random times; in the recording, the times in one of them differ '
+            f'by only {100.0 * least:.0f} %, as of a periodic load')
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
@@ -541,22 +557,6 @@ class RegimeSwitching(Term):
         power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
         return LawFit(term, se, normal, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
-
-
-# Minimum number of complete stays in a state, and coefficient of variation below which they count
-# as even: exponential times of that number vary less with a probability of 1e-3.
-_STAYS, _EVEN = 10, 0.35
-
-
-def even_stays(path: FloatArray, at: FloatArray) -> float:
-    """Return the coefficient of variation of the stays in either state if even, else NaN."""
-    # path: a value between those of two states, shape (n,); at: times, s.
-    high = path > 0.5 * (path.min() + path.max())
-    stays = np.diff(at[1:][np.diff(high)])
-    found = [float(each.std() / each.mean()) for each in (stays[::2], stays[1::2])
-             if each.size >= _STAYS]
-    least = min(found, default=math.nan)
-    return least if least < _EVEN else math.nan
 
 
 def _counted_rates(before: FloatArray, step: float) -> FloatArray:

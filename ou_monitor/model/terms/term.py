@@ -171,6 +171,10 @@ class Term:
         """Return starting points for a fit to the residual of the model, best first."""
         return ()
 
+    def objection(self, path: FloatArray, at: FloatArray) -> str:
+        """Return an objection to the offset or log power of a fit at times, s; else empty."""
+        return ''
+
     def holds(self, view: View) -> bool:
         """Return whether the fitted parameters still describe this cause; by default True."""
         return True
