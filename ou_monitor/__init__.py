@@ -1,8 +1,8 @@
 """
 Noise-aware state estimation for UAV supply rails.
 
-Public names are loaded on first use (PEP 562): ``import ou_monitor`` is fast, and the nodes never
-load the readers of recordings.
+Public names are loaded on first use (PEP 562): ``import ou_monitor`` is fast, and the
+estimator never loads the readers of recordings.
 """
 
 from __future__ import annotations

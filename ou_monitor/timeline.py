@@ -454,7 +454,8 @@ _REVERSE = 0.05
 # Maximum share of implausible throttles that are errors of single samples, not another unit.
 WILD = 0.05
 # To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
-# deviation of that number; stamps per straight piece (with ten rows per stamp, a row is 1 %).
+# deviation of that number; stamps per straight piece (with ten rows per stamp, one row changes
+# its rate by 1 %).
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 # Maximum change by rounding, V; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0

@@ -126,7 +126,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     fall = load_fall(samples, whole.terms)
     against = doubts(whole.terms, dips, recording.duration,
                      float(np.median(samples.step[1:])), larger, fall,
-                     _of_the_path(whole, samples.t)) if causes else ()
+                     _of_the_path(whole, samples)) if causes else ()
     verdict = judge(remaining, len(causes), against)
     done(1.0)
     found = Finding(
@@ -345,11 +345,11 @@ def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
     return (*found, *more)
 
 
-def _of_the_path(model: Composite, t: FloatArray) -> list[str]:
+def _of_the_path(model: Composite, samples: Samples) -> list[str]:
     """Return objections of the terms to the path of states or levels that was found."""
     path = model.offset if model.offset is not None else (
         None if model.events is None else np.log(model.events.power))
-    said = [] if path is None else [term.objection(path, t) for term in model.terms]
+    said = [] if path is None else [term.objection(path, samples.t) for term in model.terms]
     return [one for one in said if one]
 
 

@@ -67,7 +67,7 @@ COLUMNS = (
     Column('line_rms', 'number', 'V', 'its rms'),
     Column('process', 'text', '', 'type of process'),
     Column('risk', 'number', '1', 'probability of a brown-out within the horizon at this level; '
-           'needs --brownout-voltage'),
+           'needs --brownout-voltage or --cells'),
     Column('status', 'text', '', 'result of the fit: OK, SHORT_WINDOW, or why it failed'),
     Column('flags', 'texts', '', 'cautions about the input'),
     Column('duration_s', 'number', 's', 'length of the recording'),
@@ -97,7 +97,7 @@ COLUMNS = (
     Column('alpha_p', 'number', '1', 'p-value of the test that alpha is the same at all levels'),
     Column('quality', 'texts', '', 'defects of the recording, worst first'),
     Column('risk_max', 'number', '1', 'highest risk that the node would have published during '
-           'the recording; needs --brownout-voltage'),
+           'the recording; needs --brownout-voltage or --cells'),
     Column('verdict', 'text', '', 'verdict of discover; null without --discover'),
     Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
     Column('gain', 'number', 'nat', 'gain of the extended model, per held-out sample'),

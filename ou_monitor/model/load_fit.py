@@ -132,7 +132,7 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     loads = np.stack((load, late)) - lowpass(load, t, slow)
 
     def fit(order: int, *shifts: int) -> tuple[float, float]:
-        """Return squared residuals of differences of an order, and the product with the load."""
+        """Return the squared residuals of `order`-th differences, and their product with load."""
         # X: the mean of the load over the shifts.
         X = np.diff(np.mean([[np.interp(t + shift * unit, t, row) for row in loads]
                              for shift in shifts], axis=0), order)

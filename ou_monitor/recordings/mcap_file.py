@@ -80,7 +80,7 @@ _BLOCK = 64 * 1024
 # Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
 # zeros.
 _MOST_RATIO = 256
-# Minimum of the chunk limit, bytes; number of chunks of the maximum limit that fill the memory.
+# Limit of a chunk: its minimum, bytes; its maximum is the memory divided by the second number.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 
 
@@ -193,7 +193,7 @@ class McapFile:
             'before the first message' if newest is None else
             moment(newest, self.origin_ns)) + ')'
         if rest + 1 >= _MOST_BREAKS:
-            return f'{words}; and at {rest} more places, where the search was given up'
+            return f'{words}; and at {rest} more places, after which the search ended'
         return words + (f'; and at {counted(rest, "more place")}, the last at byte '
                         f'{self.breaks[-1][0]}' if rest else '')
 
@@ -552,7 +552,7 @@ def _parse(kind: Any, content: bytes) -> Any:
     except Exception as error:
         raise Damage(f'{what} ({error!r})') from error
     if stream.count < len(content):
-        raise Damage(f'{what}: it ends before its record')
+        raise Damage(f'{what}: its content is shorter than its stated length')
     return found
 
 
@@ -615,7 +615,7 @@ def _decompressed(compression: str, data: bytes, stated: int,
         frame = lz4.frame.LZ4FrameDecompressor()
         plain = frame.decompress(data, stated)
         if not frame.eof:
-            raise Damage(f'more than {stated} bytes, or not all of them')
+            raise Damage(f'it does not unpack to {stated} bytes')
     elif compression == '':
         plain = data
     else:

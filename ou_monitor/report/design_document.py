@@ -63,7 +63,7 @@ def _risk(result: Design) -> Plot:
     plot = Plot('Risk by capacitance', 'bulk capacitance, uF', 'probability', log_x=True,
                 log_y=True)
     plot.line(1e6 * farads, np.maximum(risk, _LEAST_RISK), f'within {result.horizon:g} s'
-              + f' (below {_LEAST_RISK:g}: drawn there)' * bool((risk < _LEAST_RISK).any()),
+              + f' (drawn at {_LEAST_RISK:g} if below)' * bool((risk < _LEAST_RISK).any()),
               0, 'thick')
     plot.level(1e6 * farads, result.target, 'allowed')
     return plot.mark(1e6 * result.present.capacitance, 'present')
@@ -83,9 +83,9 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
     changed = '' if math.isclose(network.battery_voltage, flight.level) else (
-        f', changed to {network.battery_voltage:.4g} V')
-    return (f'From the recording: {flight.level:.4g} V without load at its end{changed} (by the '
-            f'load model), {cells} (highest median of 0.5 s {flight.full:.4g} V; --cells N for a '
+        f'; changed to {network.battery_voltage:.4g} V')
+    return (f'From the recording: {flight.level:.4g} V without load at its end (by the load model'
+            f'{changed}), {cells} (highest median of 0.5 s {flight.full:.4g} V; --cells N for a '
             f'pack of N cells), sag {sag:.3g} V (+- {2.0 * se:.2g} V) and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{percent(throttle)} throttle, resistance '

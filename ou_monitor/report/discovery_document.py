@@ -105,8 +105,9 @@ def _causes(finding: Finding) -> list[Part]:
              'is fitted again; its error combines the scatter of block means and the errors of '
              'the parameters. p: twice the smaller of two p-values: the likelihood '
              'ratio on the fitted part (corrected for the search) and the gain. "Exact" causes '
-             'are visible in the samples themselves; causes corrected in the samples share one '
-             'gain. Terms of one kind that share a gain are one row.', legend=True)]
+             'are visible in the samples themselves; causes whose effect was removed from the '
+             'samples share one gain. Terms of one kind that share a gain are one row.',
+             legend=True)]
 
 
 def _gain(finding: Finding, seen: Overview | None) -> list[Part]:

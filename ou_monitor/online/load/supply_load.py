@@ -32,7 +32,7 @@ TABLE = np.linspace(0.0, 1.0, 101)
 _SWEEPS = 10
 # Sentences on the relaxation for statuses in which only level, sag and noise are known.
 _NO_ALPHA = {
-    Status.NO_RELAXATION: 'The relaxation is not visible{at}: only a higher rate can show it.',
+    Status.NO_RELAXATION: 'The relaxation is not visible{at}: it is too fast or too weak.',
     Status.BURIED: 'The relaxation is buried in noise{at}.',
     Status.UNBOUND: 'No relaxation is visible in the window{at}.',
     Status.TOO_SHORT: 'The window is too short for the relaxation{at}.'}

@@ -3,7 +3,7 @@ Read ArduPilot dataflash logs, binary and text, with pymavlink.
 
 Limits: ArduPilot averages the battery's ADC before logging it, by default
 at 10 Hz.  The parameters `SERVOn_FUNCTION` of the log identify the motor
-outputs; without them outputs are taken by name only.
+outputs; without them, an output is used only if the user names it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PLAIN = (
     ('BAT2', 'Curr', CURRENT, 0, 'second battery'),
     ('CURR', 'Volt', VOLTAGE, 0, 'battery'),
     ('CURR', 'Curr', CURRENT, 0, 'battery'),
-    # Until 2015, in mV.
+    # In old logs in mV.
     ('CURR', 'Vcc', VOLTAGE, None, '5 V rail'),
     ('CUR2', 'Volt', VOLTAGE, 0, 'second battery'),
     ('CUR2', 'Curr', CURRENT, 0, 'second battery'),
@@ -131,7 +131,7 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
         copy = Path(folder) / 'log'
         copy.write_bytes(content.translate(bytes(range(0x80)) + b'?' * 0x80))
         odd = len(content) - len(content.translate(None, bytes(range(0x80, 0x100))))
-        yield str(copy), [f'{counted(odd, "byte")} that are not ASCII were read as "?".']
+        yield str(copy), [f'{counted(odd, "byte")} beyond ASCII read as "?".']
 
 
 def _close(log: Any) -> None:
@@ -273,7 +273,7 @@ def _listed_fields(name: str, columns: Columns, form: Any) -> Iterator[Series]:
         if quantity == THROTTLE:
             scale = _throttle_scale(values)
         elif field in whole:
-            # Logs from before 2014 hold integers: hundredths, and for the rail millivolts.
+            # Integers: hundredths (before 2014), and for the rail millivolts (until 2015).
             scale = 0.001 if field == 'Vcc' else 0.01
         one = Series(f'{name}.{field}', quantity, columns['t'], values * scale, f'{scale:g}',
                      words, rank, name)

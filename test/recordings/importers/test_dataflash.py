@@ -128,7 +128,7 @@ def test_text_log_with_binary_bytes(tmp_path):
     at = text.index(b'BAT, ', len(text) // 2)
     path, log = load(tmp_path, text[:at] + b'\xfe\xff' + text[at + 2:], 'a.log')
     assert choose(path, log).voltage.n == 29
-    assert log.notes == ('2 bytes that are not ASCII were read as "?".',
+    assert log.notes == ('2 bytes beyond ASCII read as "?".',
                          'Left out: 1 line not in any format of this log.')
 
 
