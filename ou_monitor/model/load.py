@@ -184,7 +184,7 @@ class LoadStart:
     delay: float = 0.0  # Delay of the recorded throttle behind the voltage, s.
     resistance: float = 0.0  # Ohm; 0: no measured current affects the voltage.
     resistance_se: float = 0.0  # Its standard error, Ohm.
-    # Residual rms while throttle moves, V, and its standard error; 0: unknown.
+    # Noise of a sample at steady throttle, midway between `flown`, V, and its error; 0: unknown.
     noise: float = 0.0
     noise_se: float = 0.0
     size_se: float = 0.0  # Relative standard error of the size of the response; 0: unknown.

@@ -288,7 +288,7 @@ class EstimatorNode(MonitorNode):
             raise InputError('Land first: throttle is not at rest.')
         if model is None:
             raise InputError('There is no model_file.')
-        if learned is None or not learned.noise > 0.0:
+        if learned is None or not learned.level > 0.0:
             raise InputError('Nothing to save: throttle moved too little to determine the sag.')
         found = loads.against(model.load)
         values = {'level_v': learned.volts, 'sag_ratio': found.sag_ratio,

@@ -30,7 +30,7 @@ WIDTH = 0.02
 # Samples farther apart than this, s, are separate blocks.
 _APART = 0.75 * WIDTH
 # Difference below which throttles count as equal; their sags differ by less than an ADC step.
-_EQUAL = 0.01
+EQUAL = 0.01
 # Maximum number of throttle changes within a bin that end a block.
 _CHANGES = 3
 
@@ -76,7 +76,7 @@ class LoadBlocks:
         alone = dt >= _APART
         fresh = alone | (np.concatenate(([step], dt[:-1])) >= _APART) | (np.diff(bins) != 0.0)
         u = np.concatenate(([held], throttle))
-        differs = ~((np.abs(np.diff(u)) <= _EQUAL) | (np.isnan(u[1:]) & np.isnan(u[:-1])))
+        differs = ~((np.abs(np.diff(u)) <= EQUAL) | (np.isnan(u[1:]) & np.isnan(u[:-1])))
         # Changes since the bin began.
         total = np.cumsum(differs & ~fresh) + changes
         base = np.maximum.accumulate(np.where(fresh, total, 0))

@@ -18,10 +18,10 @@ from ou_monitor.model.load import (
     CELL, cells_in_series, INRUSH_TIME, LAGS, LEVELS, LINEAR_LAGS, LoadStart, ripple, SLOPES,
     usual_coefficients)
 from ou_monitor.online.load.blocks import (
-    CLIP, DIVERGED, LoadBlock, LoadBlocks, LoadChange, LoadDelay, LoadNoise, log_density)
+    CLIP, DIVERGED, EQUAL, LoadBlock, LoadBlocks, LoadChange, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.current_filter import CurrentFilter, UNKNOWN_HELD
 from ou_monitor.online.load.model_watch import (
-    compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack, SIZE_ERROR)
+    BINS, compare, LoadContrasts, ModelComparison, NEAR, OTHER_LEVEL, other_pack, SIZE_ERROR)
 from ou_monitor.online.load.supply_load import (
     Basis, hold, LoadState, LoadStatus, POWER, rising, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
@@ -63,8 +63,6 @@ _PAUSE = 60.0
 _OTHER_CRAFT = 1.6
 # Relative variance of the size of the sag on another day.
 _OTHER_DAY = 0.2 ** 2
-# Number of throttle bins, and number of bins that are combined for the noise (0.1 of throttle).
-_BINS, _NEAR = 50, 5
 # dE/ds of a cell, V, at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
@@ -256,7 +254,7 @@ class LoadFilter:
         self._loaded = math.isfinite(u)
         self._known_at, self._highest = -math.inf, NAN
         # For each bin of throttle: seconds, samples, and sum of squared residuals, V^2.
-        self._flown = np.zeros((3, _BINS + 1))
+        self._flown = np.zeros((3, BINS + 1))
         self._m = np.zeros(_STATES)
         self._factor = 1.0
         self._forget()
@@ -358,7 +356,7 @@ class LoadFilter:
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
         for t, u in pieces:
             used += self._advance(t - self._t, u) * (t - self._t)
-            self._flown[0, int(u * _BINS + 0.5)] += t - self._t
+            self._flown[0, int(u * BINS + 0.5)] += t - self._t
             self._t = t
         used *= self._fall(float(m[0]))
         m[0] -= used * m[1]
@@ -406,7 +404,10 @@ class LoadFilter:
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
-            self._flown[1:, int(u * _BINS + 0.5)] += share * block.n, share * square
+            self._flown[1:, int(u * BINS + 0.5)] += share * block.n, share * square
+            if du < EQUAL:
+                self._contrasts.hear(u, share * block.n, share * square * min(
+                    1.0, CLIP ** 2 / max(score * score, 1.0)))
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
         self._density = log_density(clipped, s + R * scale)
@@ -428,14 +429,14 @@ class LoadFilter:
 
     def _deviations(self) -> tuple[float, ...]:
         """Return the rms that the load does not explain, V, in each bin of throttle."""
-        b, u = self._noise.log_variance, np.arange(_BINS + 1) / _BINS
+        b, u = self._noise.log_variance, np.arange(BINS + 1) / BINS
         if math.isnan(self._throttle):
             return (math.exp(0.5 * b[0]),) * u.size
         law = np.exp(b[0] + b[1] * ripple(u))
         seconds, samples, squares = self._flown
         # For throttles flown for less than about a second, use the law at constant throttle.
         known = float(samples.sum()) / max(float(seconds.sum()), 1.0)
-        near = [np.convolve(one, np.ones(_NEAR), 'same') for one in (samples, squares)]
+        near = [np.convolve(one, np.ones(NEAR), 'same') for one in (samples, squares)]
         return tuple(np.sqrt((near[1] + known * law) / (near[0] + known)).tolist()) if known \
             else tuple(np.sqrt(law).tolist())
 
@@ -445,7 +446,7 @@ class LoadFilter:
         if not total[-1] > 0.0:
             return self._throttle, self._throttle
         low, high = np.searchsorted(total, (share * total[-1], (1.0 - share) * total[-1]))
-        return float(low) / _BINS, float(high) / _BINS
+        return float(low) / BINS, float(high) / BINS
 
     def load(self) -> SupplyLoad:
         """Return the present result."""
@@ -560,7 +561,7 @@ class LoadFilter:
             share = found.se / found.ratio
             size_se = share * SIZE_ERROR / math.hypot(share, SIZE_ERROR)
         ohm, ohm_se, noise, noise_se, level = np.nan_to_num((
-            load.resistance, load.resistance_se, found.noise, found.noise_se, found.level)
+            load.resistance, load.resistance_se, *self._contrasts.noise(load.flown), found.level)
         ).tolist()
         scale = size ** 2 * max(1.0, self._noise.scale)
         P = 0.5 * (self._P[2:, 2:] + self._P[2:, 2:].T) * scale
@@ -575,7 +576,7 @@ class LoadFilter:
         if start is None or not math.isfinite(self._t) or math.isnan(self._highest):
             return ModelComparison()
         ohm = (NAN, NAN) if self._current is None else self._current.resistance
-        return compare(self._contrasts.against(start.coefficients), start, *ohm,
+        return compare(self._contrasts, start, *ohm,
                        other_pack(start, self._highest, self._level), date, float(self._m[1]),
                        math.sqrt(max(0.0, float(self._P[1, 1])) * max(1.0, self._noise.scale)))
 

@@ -28,11 +28,13 @@ _FORM = 0.05
 SIZE_ERROR = 0.1
 # Further relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
+# Number of throttle bins of the noise, and number of bins, 0.1 of throttle, that are combined.
+BINS, NEAR = 50, 5
+# Minimum number of samples in them.
+_LEAST_NEAR = 10.0
 # Further relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
 # (halves of gecko, nazgul and hiro, three flights of roma), with packs at different charges.
 _DISCHARGE_FORM = 0.64
-# Minimum noise, V.
-_LEAST_NOISE = 1e-6
 # A pack is weaker if its sag exceeds the model's both by this share and by this number of standard
 # errors of the logarithm (chance exceeds that number in 1 % of cases).
 _LEAST, _ERRORS = 0.10, 2.33
@@ -66,7 +68,8 @@ class ModelComparison:
     # Ratio of the resistances; NaN unless the current is known in both flights.
     resistance_ratio: float = NAN
     resistance_ratio_se: float = NAN
-    # Ratio of the residual rms while throttle moves; NaN if the model lacks it.
+    # Ratio of the noise of a sample at steady throttle, at the throttle of the model's noise; NaN
+    # unless both flights have been there.
     noise_ratio: float = NAN
     noise_ratio_se: float = NAN
     # Ratio of the discharge per load, known to a factor of two.
@@ -93,8 +96,6 @@ class Contrast:
 
     ratio: float = NAN  # Slope of voltage over predicted response
     se: float = NAN
-    noise: float = NAN  # Residual rms while throttle moves, outliers downweighted, V
-    noise_se: float = NAN
     # Mean open-circuit voltage of a cell, V, with the weights of the slope.
     level: float = NAN
     # Relative change of the slope with that voltage, 1/V, and its standard error.
@@ -103,14 +104,29 @@ class Contrast:
 
 
 class LoadContrasts:
-    """Weighted products of voltage and regressors within stretches of 2 s, means removed."""
+    """Products of voltage and regressors in stretches of 2 s, means removed; noise by throttle."""
 
     def __init__(self) -> None:
-        # For each stretch: sum of weights, 1/V^2; level of a cell, V; products of voltage and
-        # regressors.
-        self._stretches: deque[tuple[float, float, FloatArray]] = deque(maxlen=_MOST)
+        # For each stretch: level of a cell, V; weighted products of voltage and regressors.
+        self._stretches: deque[tuple[float, FloatArray]] = deque(maxlen=_MOST)
         self._begin, self._sums = NAN, np.zeros((2 + SIZE, 2 + SIZE))
         self._origin = 0.0
+        # For each bin of throttle: number of samples, and sum of squared residuals, V^2.
+        self._noise = np.zeros((2, BINS + 1))
+
+    def hear(self, throttle: float, samples: float, square: float) -> None:
+        """Take the number of samples at a steady throttle, and their squared residuals, V^2."""
+        self._noise[:, int(throttle * BINS + 0.5)] += samples, square
+
+    def noise(self, flown: tuple[float, float]) -> tuple[float, float]:
+        """Return the noise of a sample, V, midway between two throttles, and its error; or NaN."""
+        # At one throttle and per sample, because noise grows with the load, and the mean of a
+        # block has less of it at a higher rate.
+        first = max(0, int(0.5 * sum(flown) * BINS + 0.5) - NEAR // 2)
+        samples, square = self._noise[:, first:first + NEAR].sum(axis=1).tolist()
+        if samples < _LEAST_NEAR:
+            return NAN, NAN
+        return math.sqrt(square / samples), math.sqrt(0.5 * square) / samples
 
     def take(self, t: float, voltage: float, regressors: FloatArray, variance: float,
              level: float) -> None:
@@ -118,8 +134,7 @@ class LoadContrasts:
         if not t - self._begin < _STRETCH:
             total, sums = float(self._sums[0, 0]), self._sums[0, 1:]
             if total > 0.0:
-                self._stretches.append((
-                    total, level, self._sums[1:, 1:] - np.outer(sums, sums) / total))
+                self._stretches.append((level, self._sums[1:, 1:] - np.outer(sums, sums) / total))
             self._begin, self._origin = t, voltage
             self._sums = np.zeros_like(self._sums)
         row = np.array([1.0, voltage - self._origin, *regressors])
@@ -130,24 +145,16 @@ class LoadContrasts:
         if len(self._stretches) < _FEWEST:
             return Contrast()
         a = np.asarray(coefficients, dtype=np.float64)
-        weights, levels, products = map(np.array, zip(*self._stretches))
+        levels, products = map(np.array, zip(*self._stretches))
         along, squares = products[:, 0, 1:] @ a, products[:, 1:, 1:] @ a @ a
         total = float(squares.sum())
-        if not total > 0.0:
+        if not total ** 2 > _FEWEST * float(squares @ squares):
             return Contrast()
         ratio, share = float(along.sum()) / total, squares / total
-        if 1.0 / float(share @ share) < _FEWEST:
-            return Contrast()
         # Residual of each stretch from the slope of the other stretches (jackknife).
         left = (along - ratio * squares) / (1.0 - share)
-        # Average logarithms, so that glitches in one stretch do not dominate.
-        squared = (products[:, 0, 0] - 2.0 * ratio * along + ratio * ratio * squares) / weights
-        noise = 0.5 * np.log(np.maximum(squared, _LEAST_NOISE ** 2))
-        mean = float(share @ noise)
-        spread = share * (noise - mean) / (1.0 - share)
         level = float(share @ levels)
-        return Contrast(ratio, math.sqrt(float(left @ left)) / total, math.exp(mean),
-                        math.exp(mean) * math.sqrt(float(spread @ spread)), level,
+        return Contrast(ratio, math.sqrt(float(left @ left)) / total, level,
                         *_warming(levels - level, along / ratio - squares, squares))
 
 
@@ -196,9 +203,10 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     return ModelVerdict.AS_MODEL, ''
 
 
-def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str,
-            discharge: float, discharge_se: float) -> ModelComparison:
+def compare(contrasts: LoadContrasts, start: LoadStart, ohm: float, ohm_se: float, other: str,
+            date: str, discharge: float, discharge_se: float) -> ModelComparison:
     """Compare this flight with an earlier model (ohm: now; other: from `other_pack`)."""
+    found, (noise, noise_se) = contrasts.against(start.coefficients), contrasts.noise(start.flown)
     # Correct the ratio to equal levels, because the sag changes as a pack empties and warms.
     apart = found.level - (start.level or start.volts / start.cells)
     as_found = math.exp(-start.warming * apart)
@@ -208,8 +216,7 @@ def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other:
     verdict, words = (ModelVerdict.OTHER_PACK, other) if other else judge(ratio, se, date)
     return ModelComparison(
         verdict, ratio, se, *_over(ohm, ohm_se, start.resistance, start.resistance_se),
-        *_over(found.noise, math.hypot(found.noise_se, _NOISE_FORM * found.noise), start.noise,
-               start.noise_se),
+        *_over(noise, math.hypot(noise_se, _NOISE_FORM * noise), start.noise, start.noise_se),
         *_over(discharge, math.hypot(discharge_se, _DISCHARGE_FORM * discharge), start.discharge,
                0.0), words)
 

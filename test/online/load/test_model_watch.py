@@ -8,6 +8,11 @@ import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor
 from ou_monitor.model.load import WARMING, WARMING_SE
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_dependent import LoadDependentNoise
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
+from ou_monitor.model.terms.slow import Drift
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelVerdict
 from ou_monitor.recordings.model_file import read_model
@@ -41,8 +46,8 @@ def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
     found = report.model
     assert found.verdict is verdict
     assert abs(found.sag_ratio - age) < 1.96 * found.sag_ratio_se < 0.14 * age
-    # Of these simulated flights the ratio is 1.4 to 1.8 (8 seeds), not 1: 2.6 errors at most.
-    assert abs(found.noise_ratio - 1.0) < 2.6 * found.noise_ratio_se < 0.95
+    # The simulated noise has longer tails than the recorded one, so the ratio is 1.06 to 1.28.
+    assert abs(found.noise_ratio - 1.0) < 2.0 * found.noise_ratio_se < 0.4
     assert report.fields['model_verdict'] == verdict.name
     assert float(report.fields['model_sag_ratio']) == found.sag_ratio
     low, high = map(float, report.fields['model_sag_ratio_95'].split())
@@ -51,6 +56,46 @@ def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
     words = f'above the model of {GECKO.date}: weak or cold pack'
     assert GECKO.date and (words in report.summary) is weaker
     assert bool(found.words) is weaker and (report.level >= Level.WARN or not weaker)
+
+
+def sticks(t):
+    """Return throttles of 0.2 to 0.9, each held for 1 s on average."""
+    rng = np.random.default_rng(1)
+    ends = np.cumsum(rng.exponential(1.0, 400))
+    return rng.uniform(0.2, 0.9, ends.size)[np.searchsorted(ends, t, 'right')]
+
+
+@pytest.mark.parametrize('noise', [
+    (), (MeasurementNoise(0.03),), (MeasurementNoise(0.02), Quantization(0.05)),
+    (MeasurementNoise(0.015), LoadDependentNoise((0.0,) * 3, (0.0, 0.4, 0.9), (0.0, 0.8, 1.5)))],
+    ids=['ou', 'white', 'adc', 'load'])
+def test_the_noise_ratio_is_1_whatever_rate_and_throttle(noise):
+    """The ratio of a flight scatters by 0.03 to 0.1, hence the median of nine by 0.04 at most."""
+    model = SupplyModel((OU(8.0, 0.15, 16.5), LoadSag(0.6, 2.4), LoadTransient(-1.2, 0.05, 0.0),
+                         Drift(-4e-3, 0.0), *noise))
+
+    def flown(throttle, duration, rate, seed):
+        t = np.arange(0.0, duration, 1.0 / rate)
+        u = throttle(t)
+        return t, model.simulate(t, np.random.default_rng(seed), u), u
+
+    loads = LoadFilter()
+    loads.push(*flown(FLOWN, 120.0, 100.0, 99))
+    start = loads.learned()
+
+    def compared(throttle, rate, seed, more=0.0):
+        t, voltage, u = flown(throttle, 60.0, rate, seed)
+        other = LoadFilter()
+        other.begin_with(start)
+        other.push(t, voltage + more * np.random.default_rng(5).standard_normal(t.size), u)
+        return other.against(start)
+
+    found = [compared(*course, seed) for course in (
+        (FLOWN, 50.0), (sticks, 100.0), (sticks, 400.0)) for seed in (1, 2, 3)]
+    assert abs(np.median([one.noise_ratio for one in found]) - 1.0) < 0.1
+    assert max(abs(one.noise_ratio - 1.0) / one.noise_ratio_se for one in found) < 2.0
+    rattling = compared(sticks, 100.0, 4, 3.0 * start.noise)
+    assert abs(rattling.noise_ratio - math.sqrt(10.0)) < 2.0 * rattling.noise_ratio_se
 
 
 def test_a_load_that_empties_the_pack_faster_is_measured():
