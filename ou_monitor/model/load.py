@@ -5,7 +5,8 @@ Limits: the form and its constants were chosen on nine recordings (doc/load.md);
 from the load, so if only throttle is known, wind and payload cause errors; all motors are alike.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
-x = ul^p (E/3.8)^(p-1) exp(-2 h), ul = LP(u, lag), dq = x dt / (mean x T), dh = (sag/V) dq,
+x = ul^p (E/3.8)^(p-1) exp(-k h), ul = LP(u, lag), dq = x dt / (mean x T),
+dh = (sag/V) dq - h dt / 120 s,
 with u throttle, E(s) of `open_circuit`, h Ohmic heat, and LP(x, tau) a low-pass of order 1.
 
 The start values (`LoadStart`: the response to throttle, known at take-off) come from one craft and
@@ -43,9 +44,8 @@ _KNEE, _KNEE_SLOPE = 0.079, 1.2
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
-# Decrease of ln(resistance) per unit of charge and relative sag.  Without cooling (150 Wh/kg,
-# 1 kJ/kg/K, -1.5 %/K) it would be 8; with cooling and wires it is 2, chosen on the recordings.
-_HEATING = 2.0
+# Time constant with which a pack cools, s (60 and 120 fit the recordings equally well).
+_COOLING = 120.0
 
 
 def open_circuit(charge: npt.ArrayLike) -> FloatArray:
@@ -108,6 +108,9 @@ class LoadModel:
     # Current at full load, A, negative if discharge currents are negative; 0: load is throttle.
     full_current: float = 0.0
     delay: float = 0.0  # Delay of the load behind the voltage, s
+    # Decrease of ln(resistance) per unit of charge and relative sag; without cooling (150 Wh/kg,
+    # 1 kJ/kg/K, -1.5 %/K) it would be 8.
+    heating: float = 2.0
     constant_level: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
@@ -142,7 +145,8 @@ class LoadModel:
         if math.isnan(self.constant_level):
             # Ohmic heat warms the pack, which lowers its resistance.
             total = self.size * (1.0 + self.fast_share + self.slow_share)
-            x = x * np.exp(-_HEATING * np.cumsum(total * x * x * dt / full))
+            x = x * np.exp(-self.heating * total * _COOLING / full * lowpass(
+                x * x, t, _COOLING, 0.0))
             rest = self.cells * open_circuit(np.maximum(
                 self.charge - np.cumsum(x * dt) / full, -1.0))
         response = x + self.fast_share * lowpass(x, t, self.fast_time)

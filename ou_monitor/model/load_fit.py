@@ -29,9 +29,10 @@ _PRIOR = {
     'slow_share': (math.log(0.3), 0.3), 'slow_time': (math.log(20.0), 0.3),
     'inrush': (math.log(0.5), 1.0), 'lag': (math.log(0.01), 1.2),
     'endurance': (math.log(450.0), 0.6), 'charge': (0.7, 0.3), 'before': (0.3, 0.4),
+    'heating': (2.0, 1.0),
 }
 _NAMES = tuple(_PRIOR)
-_LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
+_LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5), 'heating': (0.0, 8.0)}
 # Prior deviations and centres for a current, whose scale and use are unknown.
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
@@ -63,7 +64,7 @@ class LoadFit:
     """A fitted load model, and its errors."""
 
     model: LoadModel
-    # Covariance of the parameters as fitted: logarithms, except charge and before; shape (11, 11).
+    # Covariance of the parameters as fitted, logarithms unless in _LINEAR; shape (12, 12).
     covariance: FloatArray
     condition: float  # Condition number of the Jacobian in prior deviations
     noise_std: float  # White noise of a 50 ms mean, V

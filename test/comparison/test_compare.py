@@ -16,6 +16,7 @@ from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.records import Recording
 from ou_monitor.report.comparison_document import _answer, _path
 import pytest
+from scipy.signal import lfilter
 
 ALPHA, SIGMA, LEVEL, SAG = 20.0, 0.3, 15.0, 1.5
 
@@ -159,6 +160,38 @@ def test_the_second_half_follows_from_the_first():
     # What is farthest off is named, too, though it is within chance.
     assert found.words
     assert found.farthest in ('lowest', 'dips', 'level', 'answer', 'spectrum', 'ks')
+
+
+@pytest.mark.parametrize('warming', [0.0, 6.0])
+def test_how_much_a_pack_warms_is_fitted(warming):
+    """A pack with another curve of the cell, whose resistance is constant, or falls by a third."""
+    rng = np.random.default_rng(2)
+    n, dt = 6000, 0.02
+    t, keep = dt * np.arange(n), math.exp(-1.2 * dt)
+    u = 0.33 + lfilter([0.07 * math.sqrt(1.0 - keep ** 2)], [1.0, -keep], rng.standard_normal(n))
+    at = 4.0
+    while at < 112.0:
+        end = at + rng.uniform(0.3, 1.6)
+        u[(t >= at) & (t < end)] = rng.uniform(0.7, 1.0)
+        at = end + 1.5 + rng.exponential(4.0)
+    u = np.clip(u, 0.0, 1.0)
+    curve = ([0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0],
+             [3.30, 3.55, 3.66, 3.73, 3.79, 3.88, 4.02, 4.10, 4.19])
+    charge, slow, heat, motor, v = 0.97, 0.0, 0.0, 0.0, np.full(n, 16.0)
+    for k in range(n):
+        motor += -math.expm1(-dt / 0.04) * (u[k] - motor)
+        current = 0.6 + 118.0 * motor ** 1.9 * v[k - 1] / 15.2
+        ohm = 0.021 * math.exp(-warming * heat)
+        v[k] = 4.0 * np.interp(charge, *curve) - slow - ohm * current
+        slow += -math.expm1(-dt / 1.5) * (0.5 * ohm * current - slow)
+        drawn_now = current * dt / 3600.0 / 1.3
+        charge -= drawn_now
+        heat += 1.5 * ohm * current / 15.2 * drawn_now
+    assert (math.exp(-warming * heat) < 0.75) is (warming > 0.0)
+    v += (0.012 + 0.08 * u) * rng.standard_normal(n)
+    found = compare(Recording(t, 0.01 * np.rint(100.0 * v), u, 'pack'), seeds=40)
+    assert found.verdict is Likeness.LOOKS_LIKE_IT, found.words
+    assert found.lowest.inside
 
 
 def test_jitter_of_throttle_is_no_noise_and_no_path():
