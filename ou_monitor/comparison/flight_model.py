@@ -274,13 +274,13 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
     """Fit a model to samples: at least 100, over several seconds (report: progress, 0..1)."""
     mean = float(samples.voltage.mean())
     best = _best(samples, lambda share: report(0.4 * share))
+    held_out = []
     if best is not None:
-        parts = []
-        for j, part in enumerate(_parts(samples)):
+        for j in range(_PARTS):
+            part = slice(*(k * samples.t.size // _PARTS for k in (j, j + 1)))
             fit = _fit(samples, best.current, best.constant_level, part, best.fit)
-            parts.append((fit, samples.voltage[part] - _path(samples, fit, best.current)[part]))
+            held_out.append((_path(samples, fit, best.current)[part], samples.voltage[part]))
             report(0.4 + 0.5 * (j + 1.0) / _PARTS)
-        best = replace(best, parts=tuple(parts))
     load = None if best is None else best.fit
     path = np.full(samples.t.size, mean) if best is None else _path(
         samples, best.fit, best.current)
@@ -293,19 +293,18 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
     return FlightModel(
         load, None if best is None else best.other, 0.0 if best is None else best.doubt,
         mean, noise.mean_error(duration), damped,
-        0.0 if best is None else _sag_error(samples, best), noise, float(samples.t[-1]))
+        _sag_error(held_out), noise, float(samples.t[-1]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load and its fit; for each part, a fit to the other parts and its errors there, V."""
+    """A load and its fit."""
 
     fit: LoadFit
     current: FloatArray | None
     constant_level: bool
     other: LoadFit  # Fit with the other kind of level
     doubt: float  # Probability of the other kind of level
-    parts: tuple[tuple[LoadFit, FloatArray], ...] = ()
 
 
 def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
@@ -334,11 +333,6 @@ def _loads(samples: Readings) -> list[FloatArray | None]:
     if samples.current is not None and np.ptp(samples.current) > 0.0:
         found.append(samples.current)
     return found
-
-
-def _parts(samples: Readings) -> list[slice]:
-    edges = np.linspace(0, samples.t.size, _PARTS + 1).astype(int)
-    return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
 
 
 def _fit(samples: Readings, current: FloatArray | None, constant_level: bool,
@@ -377,15 +371,16 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
     return best
 
 
-def _sag_error(samples: Readings, load: _Load) -> float:
-    """Return the relative error of a sag averaged over two parts, from all held-out parts."""
-    # In each held-out part, the voltage is regressed on the predicted path.  Temperature, wind and
-    # simplifications of the load model make the slope differ from 1.  Parts in which the path
-    # moves more have more weight.
-    squares, weights = [], []
-    for (fit, errors), part in zip(load.parts, _parts(samples)):
-        path = _path(samples, fit, load.current)[part]
+def _sag_error(held_out: list[tuple[FloatArray, FloatArray]]) -> float:
+    """Return the relative error of a sag over as long as the fit, from held-out parts."""
+    # In each part, the voltage is regressed on the path, V, predicted from the other parts.
+    # Temperature, wind and simplifications of the load model make the slope differ from 1.  Parts
+    # in which the path moves more have more weight.
+    squares = weights = 0.0
+    for path, voltage in held_out:
         moved = path - path.mean()
-        weights.append(float(moved @ moved))
-        squares.append((float(moved @ errors) / max(weights[-1], 1e-300)) ** 2)
-    return math.sqrt(float(np.dot(squares, weights)) / max(sum(weights), 1e-300) / 2.0)
+        weight = float(moved @ moved)
+        squares += float(moved @ (voltage - path)) ** 2 / max(weight, 1e-300)
+        weights += weight
+    # If parts scatter by s, these errors do by s sqrt(1 + 1/3); means of four parts by s / 2 each.
+    return math.sqrt(3.0 / 8.0 * squares / max(weights, 1e-300))

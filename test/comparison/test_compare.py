@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor.comparison.compare import compare
-from ou_monitor.comparison.flight_model import damping, fit_flight, Readings
+from ou_monitor.comparison.flight_model import _sag_error, damping, fit_flight, Readings
 from ou_monitor.comparison.yardstick import Likeness
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
@@ -269,6 +269,17 @@ def test_a_bench_supply_does_not_discharge():
     found = compare(Recording(t, v, u, 'bench'), fit_until=30.0, seeds=20)
     assert found.explained > 0.95
     assert any('the level is constant' in note for note in found.notes)
+
+
+def test_the_error_of_the_sag_is_that_between_two_means_of_four_parts():
+    """Each part is held out from a model of the other three."""
+    moved = throttle(np.arange(1000) / 100.0)
+    sags = np.array([0.9, 1.0, 1.04, 1.1])
+    others = (sags.sum() - sags) / 3.0
+    # Relative to a sag of 1 V of the model.
+    parts = [(15.0 - moved, 15.0 - (1.0 + one - other) * moved)
+             for one, other in zip(sags, others)]
+    assert _sag_error(parts) == pytest.approx(math.sqrt(2.0 * sags.var(ddof=1) / 4.0))
 
 
 def test_both_kinds_of_level_are_simulated_by_their_probability():
