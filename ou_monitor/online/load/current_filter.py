@@ -52,6 +52,8 @@ _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # 0.007 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and
 # regbot_28, 62 and 81.
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
+# Exponents of throttle tried for that regressor.
+_POWERS = np.array([1.4, 1.6, 1.8, 2.0, 2.2])
 # Time for which the last throttle or current is held if the present one is unknown, s.
 UNKNOWN_HELD = 1.0
 
@@ -71,8 +73,9 @@ class CurrentFilter:
         self.delay = LoadDelay(either=True)
         # Regression of current on throttle: weighted products of (1, x, u, u^3, current).
         self._squares = np.zeros((5, 5))
-        # Weighted products of band-passed x, current and voltage; their two low-passes.
-        self._beside, self._lags = np.zeros((3, 3)), np.zeros((2, 0))
+        # Weighted products of band-passed powers of throttle, current and voltage; the low-passes.
+        self._beside = np.zeros((_POWERS.size + 2, _POWERS.size + 2))
+        self._lags = np.zeros((2, 0))
 
     def time(self, block: LoadBlock) -> None:
         """Update the delay of the current from a block, before its load is delayed."""
@@ -152,12 +155,12 @@ class CurrentFilter:
             self._follow(block, dt, cells)
         self._load = self._drawn[0] / self._largest
         if math.isfinite(block.throttle):
-            self._compare(np.array([block.throttle ** POWER, x, block.voltage]),
+            self._compare(np.array([*block.throttle ** _POWERS, x, block.voltage]),
                           0.0 if lost else dt)
         self.rest = block.voltage - float(self._regressors()[2:] @ self._m[2:])
 
     def _compare(self, now: FloatArray, dt: float) -> None:
-        """Update the products that `_bypassed` uses; now: x, current and voltage."""
+        """Update the products that `_bypassed` uses; now: see `_beside`."""
         if not dt or not self._lags.size:
             self._lags = np.stack((now, now))
         self._lags = self._lags - np.expm1(-dt / _BAND) * (now - self._lags)
@@ -171,14 +174,19 @@ class CurrentFilter:
         # the share of the residual voltage that throttle explains.  Both are computed after a
         # band-pass, because throttle also explains fast errors of the sensor, and the level
         # changes slowly.
-        (xx, xi, xv), (_, ii, iv), (_, _, vv) = self._beside.tolist()
+        # x is the power of throttle that the current follows best, so that a wrong exponent is not
+        # mistaken for another load.
+        B, n = self._beside, _POWERS.size
+        best = int(np.argmax(B[:n, n] ** 2 / np.maximum(B.diagonal()[:n], 1e-300)))
+        at = np.array([best, n, n + 1])
+        (xx, xi, xv), (_, ii, iv), (_, _, vv) = B[np.ix_(at, at)].tolist()
         # Residual squares of voltage and x, and their residual product, after regression on
         # current.
         rest, moved, both = (vv - iv * iv / ii, xx - xi * xi / ii, xv - xi * iv / ii
                              ) if ii > 0.0 else (0.0, 0.0, 0.0)
         if not (rest > 0.0 and moved > _APART * xx and iv):
             return 0.0
-        return abs(both / moved * xi / iv) * both * both / (moved * rest)
+        return float(abs(both / moved * xi / iv) * both * both / (moved * rest))
 
     def _follow(self, block: LoadBlock, dt: float, cells: float) -> None:
         m, P = self._m, self._P

@@ -107,6 +107,21 @@ def test_a_current_that_throttle_determines_is_still_a_resistance(seed):
     assert abs(load.resistance - 0.03) < 2.0 * load.resistance_se
 
 
+@pytest.mark.parametrize('exponent', [1.6, 2.1])
+@pytest.mark.parametrize('seed', range(4))
+def test_another_exponent_of_throttle_is_no_load_that_bypasses_the_sensor(seed, exponent):
+    """A small pack that empties and polarises: the error stays at its minimum, a tenth."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 120.0, 0.02)
+    u = np.clip(0.35 + 0.2 * rng.standard_normal(241), 0.05, 1.0)[(2 * t).astype(int)]
+    current = 80.0 * lowpass(u, t, 0.05) ** exponent
+    drawn = 0.02 * np.cumsum(current) / 3600.0
+    v = (16.5 - 1.5 * drawn - 0.015 * current - 0.006 * lowpass(current, t, 6.0)
+         + 0.02 * rng.standard_normal(t.size))
+    load = loaded(t, v, u, current)
+    assert load.resistance == pytest.approx(0.015 + 0.006 * (1.0 - np.exp(-1.0 / 6.0)), rel=0.1)
+    assert load.resistance_se < 0.12 * load.resistance
+
+
 def test_a_current_that_pauses(flight):
     """Holes of a second and of ten; the resistance is kept over both."""
     t, v, u, current = flight
