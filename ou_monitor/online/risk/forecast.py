@@ -520,12 +520,13 @@ class Forecast:
         # A fall within a shorter horizon is also within this one, and shorter horizons have more
         # data.
         return np.asarray(np.max(self._risks_if(
-            state, u, dwell, voltage, _shorter_horizons(horizon)), axis=0))
+            state, u, dwell, voltage, _shorter_horizons(horizon), sag), axis=0))
 
     def _risks_if(self, state: LoadState | None, u: FloatArray, dwell: float, voltage: float,
-                  horizons: list[float]) -> list[FloatArray]:
+                  horizons: list[float], sag: float = 1.0) -> list[FloatArray]:
         """Return the risk within each horizon, s, by the law of that horizon alone; (k,)."""
-        now, drops = self.voltage, [self._drops(one)[1] for one in horizons]
+        # Drops and misses of this flight are due to its sag, and change with it by the factor sag.
+        now, drops = self.voltage, [sag * self._drops(one)[1] for one in horizons]
         if now <= voltage:
             return [np.ones(u.shape)] * len(horizons)
         if state is None or math.isnan(now) or np.isnan(drops).any():
@@ -539,7 +540,7 @@ class Forecast:
             law, wrong, n, squares, *_ = self._learned(one)
             middle, spread = law.moments(mean, own, error, start)
             either = below(voltage, middle, np.stack((
-                _wider(spread, deviation, (n, squares)), spread)))
+                _wider(spread, deviation, (n, sag * sag * squares)), spread)))
             risks.append(wrong * either[0] + (1.0 - wrong) * either[1])
         return risks
 

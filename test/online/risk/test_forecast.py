@@ -188,6 +188,14 @@ def test_flying_at_the_budget_dips_as_often_as_told():
     assert dips(report.budget - 0.05) < 0.1 < dips(report.budget + 0.05)
 
 
+def test_a_quarter_of_the_sag_leaves_a_quarter_of_its_errors():
+    """The drops that the law missed in this flight came from its sag, and shrink with it."""
+    monitor, _ = monitor_of()
+    assert monitor.changed_risk(1.0, 1.0, 14.6)[-1] > 0.3
+    # The mean stays a volt, 25 deviations of the noise, above the limit.
+    assert monitor.changed_risk(0.25, 1.0, 14.6)[-1] < 1e-4
+
+
 def test_asking_changes_nothing_and_is_quick():
     monitor, _ = monitor_of()
     first = monitor.risk(14.8, 1.0), monitor.risk_if(0.8, 0.5, 14.8, 1.0)
