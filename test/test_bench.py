@@ -81,7 +81,7 @@ def test_the_axis_of_the_plot_follows_the_risk(limit):
     drawn = np.log10(np.concatenate([curve.y for curve in plot.curves]))
     assert low < drawn.min() and drawn.max() < high
     assert np.ptp(drawn) > (high - low) * 2.0 / 3.0
-    assert ('below 1e-09' in plot.curves[0].label) == (min(row.risk for row in found.rows) < 1e-9)
+    assert ('at 1e-09' in plot.curves[0].label) == (min(row.risk for row in found.rows) < 1e-9)
 
 
 def test_simulate_equals_the_command(tmp_path):
