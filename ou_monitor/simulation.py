@@ -311,8 +311,8 @@ def lacks(model: SupplyModel) -> tuple[str, ...]:
     if not any(term.FAMILY == 'load' for term in model.terms):
         missing.append('no response to throttle (load_sag)')
     if not model.charged:
-        missing.append('no charge (load)' + ('' if 'drift' in names else ' and no drift')
-                       + ': it never discharges')
+        missing.append('no charge (load)' + (
+            '' if 'drift' in names else ' and no drift: it never discharges'))
     return tuple(missing)
 
 

@@ -51,7 +51,7 @@ class Analysis:
     by_throttle: ByThrottle  # Risk over throttle
     sliding: Sliding  # Estimates and risk of the node over time
     quality: tuple[QualityItem, ...]  # Cautions about the numbers, worst first
-    brownout_default: bool  # Whether the voltage of the risk is the default of the node
+    brownout_default: bool  # Whether no voltage was given: the node's default on a 5 V rail
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise
     craft: Craft  # Cells, and a comparison with known craft

@@ -189,7 +189,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
     blocks = min(blocks, total.size // FEWEST)
     if blocks < 3:
         return TestResult('mean_drift', why_not=(
-            f'fewer than three blocks of {_MEAN_BLOCK:g} relaxation times'))
+            f'fewer than three blocks of {_MEAN_BLOCK:g} relaxation times, {FEWEST} samples'))
     centre = float(total.mean())
     z = join([innovations(t, v - centre, alpha, var_inf, noise_var) for t, v in parts])
     # A shift of the voltage shifts all innovations equally, except the first of each part, which

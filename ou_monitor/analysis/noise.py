@@ -69,7 +69,7 @@ def rise_at(recording: Recording, t: FloatArray) -> FloatArray:
 
 
 def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
-    """Return the hysteresis of a dip, V, at each reading: ADC step or steady noise."""
+    """Return the hysteresis of a dip, V, at each reading: the larger of ADC step and noise."""
     rms, throttle = np.array(noise.steady_rms_v), np.array(THROTTLES)
     known = np.isfinite(rms)
     steady = np.interp(np.nan_to_num(u), throttle[known], rms[known]) if known.any() else 0.0
@@ -190,7 +190,7 @@ def _needed_readings(recording: Recording) -> float:
 
 def _over_throttle(u: FloatArray, square: FloatArray, enough: float,
                    beyond: float | None = None) -> tuple[float, ...]:
-    """Return rms, V, interpolated at THROTTLES; `beyond` (or the nearest) outside those flown."""
+    """Return rms, V, at THROTTLES; beyond those flown, `beyond` or (None) the nearest value."""
     at, rms = [], []
     for throttle in THROTTLES:
         near = np.abs(u - throttle) <= BAND

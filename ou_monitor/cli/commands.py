@@ -330,9 +330,9 @@ _CONVERT = Command(
      *CSV, JSON, FORCE),
     ('flight.ulg --list', 'flight.bbl flight.mcap --flight 2',
      'flight.bin flight.mcap --signal RCOU.C3'),
-    'Read: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
-    '(.bbl, .bfl), Crazyflie micro-SD logs, CSV; the first bytes decide, '
-    'not the ending.')
+    'Formats: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
+    '(.bbl, .bfl), Crazyflie micro-SD logs, CSV; they are recognised by the first bytes, not by '
+    'the ending of the name.')
 
 _COUPLING = Command(
     'coupling', 'gain from the supply voltage to a signal, such as a gyro axis',
@@ -355,7 +355,7 @@ _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
-    'power network, for a range of bulk capacitances, and find the smallest that meets a risk.',
+    'power network, for a range of bulk capacitances; find the smallest that keeps to --risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a recording; --set overrides it '
             '(cells=0: the voltage is of a rail, not a pack)'),
@@ -364,7 +364,7 @@ _DESIGN = Command(
             '%(default)s, as for the throttle budget of analyze)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
-            help='throttle, 0..1 (default with --from: the flight exceeds it 1 %% of the time)'),
+            help='throttle, 0..1 (default with --from: exceeded for 1 %% of the flight)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      *limit('brown-out level, V (default: 3.3 V per cell on the bus; 4.5 V on a regulated rail of '
@@ -436,8 +436,8 @@ _LIVE = Command(
     'Serve one read-only page: voltage and its limit, throttle and its budget, risk, sigma, the '
     'filter, and an alarm lamp, from the topics of the running nodes. Needs ROS 2.',
     (Option('--host', metavar='ADDRESS', default='127.0.0.1',
-            help='address to listen on (default: %(default)s); any other requires the printed '
-            'token'),
+            help='address to listen on (default: %(default)s); one that other computers can reach '
+            'requires the printed token'),
      Option('--port', metavar='N', default=8765, type=whole('a port, 0 to 65535', 0, 65535),
             help='port; 0: any that is free (default: %(default)s)'),
      Option('--estimator', metavar='NODE', default='/ou_estimator',

@@ -93,8 +93,8 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         full_current=model.full_current)
     notes = _omitted_terms(model, target, throttle, rate)
     if target == 'gazebo' and n.usual_sag:
-        notes.append(f'load_sag is for a constant load, {n.usual_sag:.3g} V: throttle does not '
-                     'change it')
+        notes.append(f'load_sag is the sag under the usual load, {n.usual_sag:.3g} V: throttle '
+                     'does not change it')
     if target != 'px4' and n.sag:
         notes.append('the resistance is computed from the settled fall at '
                      f'{"the usual load" if target == "gazebo" else "full throttle"}; analyze '
@@ -208,8 +208,8 @@ def _omitted_terms(model: SupplyModel, target: str, throttle: FloatArray, rate: 
             *model.terms[:k], *model.terms[k + 1:])
         # The random draws of a term do not depend on other terms: the difference is its effect.
         moved = whole - _simulated(SupplyModel(rest, model.load), throttle, rate)
-        notes.append(f'{term.NAME} is left out: {1e3 * float(np.std(moved)):.3g} mV rms, up to '
-                     f'{1e3 * float(np.abs(moved).max()):.3g} mV')
+        notes.append(f'{term.NAME} is left out; its effect: {1e3 * float(np.std(moved)):.3g} mV '
+                     f'rms, up to {1e3 * float(np.abs(moved).max()):.3g} mV')
     return notes
 
 

@@ -372,7 +372,7 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 
 def _sag_error(held_out: list[tuple[FloatArray, FloatArray]]) -> float:
-    """Return the relative error of a sag over as long as the fit, from held-out parts."""
+    """Return the relative error of a sag over a time as long as the fitted part."""
     # In each part, the voltage is regressed on the path, V, predicted from the other parts.
     # Temperature, wind and simplifications of the load model make the slope differ from 1.  Parts
     # in which the path moves more have more weight.

@@ -291,8 +291,8 @@ def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.fl
     return np.array(found)
 
 
-# Probability of a false `DIFFERS` by the largest score; with fewer than 49 simulations, the score
-# must exceed all of theirs.
+# Probability of a false `DIFFERS` by the largest score; with n < 49 simulations it is 1 / (n + 1),
+# and the score must exceed all of theirs.
 LEVEL = 0.02
 # Importance for a pilot, relative to the lowest voltage and the number of dips.
 _WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'line': 0.8,

@@ -201,7 +201,7 @@ def _inputs(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tu
             yield f'throttle change over {span:g} s', score(w, recent)
             if span in (0.05, 2.0):
                 yield f'throttle direction over {span:g} s', score(w, np.abs(recent))
-    # `analyze` compares sigma, and alpha, between levels of constant throttle instead.
+    # `analyze` instead compares sigma and alpha between levels of constant throttle.
     yield 'variance throttle', score(square, u)
     yield 'variance throttle squared', score(square, centre * centre - slope * centre)
     keep = math.exp(-1.0 / max(0.05 * given.rate, 1.0))

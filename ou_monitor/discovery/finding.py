@@ -57,7 +57,7 @@ class Cause:
     """A cause that was named."""
 
     term: Term
-    se: Mapping[str, Any]  # Standard errors, in the units of the parameters; NaN where not known
+    se: Mapping[str, Any]  # Errors, in the parameters' units; NaN: unknown, inf: undetermined
     # Loss of held-out score without the cause, nats per sample.
     gain: float
     gain_se: float
@@ -83,7 +83,7 @@ class LowDips:
 
     level: float = NAN  # V
     count: int = 0  # Dips in the samples
-    made: int | None = None  # Dips that the lowest load avoids; None: no response to load
+    made: int | None = None  # Dips that the lowest load would avoid; None: no load response
     # Dips per minute in the samples and on average in simulations.
     observed: float = NAN
     baseline: float = NAN

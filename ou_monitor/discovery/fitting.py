@@ -163,7 +163,7 @@ class Fitter:
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
-            # A law that has starting points is fitted as another term of its name.
+            # The starting points of a law are terms of its name in another role.
             starts = kind.candidates(view) if kind.ROLE is Role.LAW else None
             if starts == () and not self._finds_events(kind, view):
                 gain, start = self._law_gain(kind, view), None

@@ -183,6 +183,6 @@ def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float
         return f'The extended model cannot be simulated ({error})'
     if far > 0.0:
         by = 'without bound' if math.isinf(far) else f'by {far:.2g} V'
-        return ('Simulations of the extended model exceed the recorded range, widened by half of '
-                f'it at both ends, {by}')
+        return ('Simulations of the extended model exceed the recorded range and its margin (half '
+                f'of the range at either end) {by}')
     return ''

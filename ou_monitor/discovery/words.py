@@ -170,8 +170,8 @@ def no_relaxation_note(alpha: float, step: float) -> str:
 
 def coupling_found(duration: float) -> str:
     """Return what would confirm an AC coupling that was found."""
-    return (f'An AC coupling was found in {number(duration)} s; its evidence grows by 0.24 nats '
-            'in each relaxation time of the rail. A DC-coupled recording would settle it.')
+    return (f'An AC coupling was found in a recording of {number(duration)} s; its evidence grows '
+            'by 0.24 nats in each relaxation time. A DC-coupled recording would settle it.')
 
 
 def remaining_words(left: Sequence[Criticism]) -> str:
@@ -232,7 +232,7 @@ def collinear_note(inflation: float, limit: float) -> str:
     """Return a note that sag and drift are hard to tell apart."""
     return ('Throttle follows the time like a staircase or a ramp (variance inflation '
             f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
-            'apart, and the errors of the response include that. Return to a low throttle between '
+            'apart, so the errors of the response are larger. Return to a low throttle between '
             'the steps.')
 
 
@@ -393,7 +393,7 @@ def by_load(text: str, load: str) -> str:
 
 
 def plain_name(term: Term) -> str:
-    """Return the plain name of a cause, by the inputs of its curves."""
+    """Return the plain name of a cause; it states the inputs of the cause's curves."""
     name, curves = PLAIN_NAMES.get(term.NAME, term.NAME), term.factors()
     return name if not curves or 'throttle' in curves else name.replace(
         'throttle', 'changes of throttle')

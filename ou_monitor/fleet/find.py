@@ -153,7 +153,7 @@ def _has_columns(path: Path) -> bool:
     try:
         return holds_supply(path)
     except Exception:
-        # A defect of this package: the row of this file reports it.
+        # A defect of this package; the row of the file in the table reports it.
         return True
 
 

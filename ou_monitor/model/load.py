@@ -37,8 +37,8 @@ _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
 # Charge below which a straight line replaces the curve, and its slope, V: an error of a few per
 # cent in the charge must not put a prediction beyond the knee.  Slopes of 0.6 to 2.0 V work.
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
-# Relative change of the response per volt of a cell's open-circuit voltage, 1/V, in addition to
-# the propeller's (a pack warms as it empties), and scatter of this change between packs.  Measured
+# Relative change of the response per volt of a cell's open-circuit voltage, 1/V, because a pack
+# warms as it empties (the propellers' change is separate); its scatter between packs.  Measured
 # between halves of a flight or successive flights: 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro),
 # 0.5 (roma); mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
 WARMING, WARMING_SE = 0.7, 0.33

@@ -24,8 +24,8 @@ as OU.
 
 Coverage of the 95 % intervals on 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s,
 50 to 1000 Hz, OU of 20 mV, white noise to 30 mV, windows of 20 s, or 8 s above 300 Hz): alpha 93 %
-(most others lay above alpha), sigma 93 %, Var_inf 92 %; without white noise 90, 90 and 87 %.  99 %
-of the bounds were correct.
+(most intervals that missed it lay above), sigma 93 %, Var_inf 92 %; without white noise 90, 90 and
+87 %.  99 % of the bounds were correct.
 """
 
 from __future__ import annotations

@@ -344,7 +344,7 @@ class AdaptiveFilterNode(MonitorNode):
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
         if not self._passed:
-            return f'nothing yet: no message was filtered; it starts at {s.fallback:g} Hz'
+            return f'nothing yet: no message was filtered; the cutoff starts at {s.fallback:g} Hz'
         if bound is Bound.FALLBACK:
             return f'the fallback, because {_unknown(supply)}'
         if bound is Bound.LAG:

@@ -315,8 +315,8 @@ class MonitorNode(Node):
                 'changed, until the node is restarted without it')
         if self.running and any(p.name in self._fixed for p in parameters):
             return SetParametersResult(
-                successful=False, reason='it is read when the node is activated: deactivate the '
-                'node first')
+                successful=False, reason='this parameter is read when the node is activated: '
+                'deactivate the node first')
         try:
             if changed:
                 self.check({**self.values(), **changed})

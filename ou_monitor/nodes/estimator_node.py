@@ -3,8 +3,8 @@ The node `estimator`: voltage and throttle -> OU estimate, brown-out risk and fl
 
 doc/messages.md lists its topics, services and fields.  Inputs are best effort; outputs are
 reliable, at `publish_rate` in real time.  `~/brownout` is published only while the flag is known,
-so that it is never false by mistake.  Messages wait in the middleware, which keeps the newest
-2000, and are fetched 50 times a second and read before each report, so that a flood of messages
+so that it is never false by mistake.  Messages wait in the middleware (doc/reliability.md: how
+many), and are fetched 50 times a second and read before each report, so that a flood of messages
 does not delay an output.  Hold, delay and latch run in real time, even under `use_sim_time`.
 
 Limits: one voltage.  The values of an estimate older than `stale_after` are published as NaN, but

@@ -93,7 +93,7 @@ class ModelChoice:
         """Write a learned load, and an entry of the history, into the file; return its path."""
         path, file, known = self._used
         if file is None:
-            raise InputError('There is no model_file in force.')
+            raise InputError('There is no model_file in use.')
         past = file.provenance.get('history')
         history = [*(past if isinstance(past, list) else []), dict(entry)][-_HISTORY:]
         file = replace(file, model=replace(file.model, load=load, date=str(entry['date'])),

@@ -498,8 +498,8 @@ class SupplyMonitor:
         if self._faulty:
             still = f' The brown-out flag is set: {flag.reason}.' if critical else ''
             return Level.ERROR, (
-                f'The estimator failed and was restarted ({self._restarts} times so far); it has '
-                f'no estimate yet: {self._fault}.{still}')
+                f'The estimator failed ({self._fault}) and was restarted ({self._restarts} times '
+                f'so far); it has no estimate yet.{still}')
         if silence and critical and flag.low:
             return Level.ERROR, f'{self._risk_words(e, risk, flag)} {silence}'
         if silence:

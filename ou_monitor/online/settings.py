@@ -108,8 +108,8 @@ class MonitorSettings:
         0.5, 'WARN or CRITICAL ends when the risk falls below this share of the value at which it '
         'begins, from 0.001 to below 1 (default: half, our choice).', 0.001, 1.0)
     brownout_hold: float = _parameter(
-        1.0, 'Minimum duration of WARN and CRITICAL, also while the risk is unknown, s (default: '
-        'with 2 s, false alarms lasted twice as long on five recorded quads).', 0.0, 3600.0)
+        1.0, 'Minimum duration of WARN and CRITICAL, also while the risk is unknown, s (2 s made '
+        'false alarms last twice as long on five recorded quads).', 0.0, 3600.0)
     brownout_delay: float = _parameter(
         0.15, 'Time that a risk must last before WARN or CRITICAL begins, s (default: three '
         'reports; two gave twice as many false alarms on recorded quads; ArduPilot waits 10 s '

@@ -282,7 +282,7 @@ class ConstantReading:
         if self._time <= limit:
             return ''
         return (f'The sensor is stuck: the voltage has been {self.value:g} V for '
-                f'{self._time:.1f} s ({self._n} readings; accepted: {limit:.1f} s).')
+                f'{self._time:.1f} s ({self._n} readings); up to {limit:.1f} s is accepted.')
 
 
 # Number of readings whose median is compared with unit and limit.

@@ -213,8 +213,8 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     inputs = over(published.HIGH.crest_range, published.LOW.crest_range)
     result = [Row(
         WHERE, 'Vpp/Vrms, 40 % over 5 %', '', Printed('> 1'), high / low, 'quotient from Table 1',
-        '"From Gaussian noise to impulse disturbances with load" would raise it, but it falls '
-        f'from {low:.1f} to {high:.1f}; the resolution of the readings allows a quotient of '
+        '"From Gaussian noise to impulse disturbances with load" would raise Vpp/Vrms, but it '
+        f'falls from {low:.1f} to {high:.1f}; the resolution of the readings allows a quotient of '
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
     for state in (published.LOW, published.MEDIUM):
         value, inputs = state.crest, state.crest_range
@@ -228,7 +228,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
                 f'Largest mean: {best.mean:.1f} ({best.band[0]:.1f} to {best.band[1]:.1f}), '
                 f'with {best.rate:g} jumps a second of {best.size(state.vrms.value):.0f} mV rms, '
                 f'{100 * best.share:.0f} % of the variance, excess kurtosis '
-                f'{best.kurtosis:.1f}; impulses too short to count in Vrms would need '
-                f'{impulse_height(state, crests):.0f} mV.',
+                f'{best.kurtosis:.1f}; impulses too short to count in Vrms would have to add '
+                f"{impulse_height(state, crests):.0f} mV to the OU's Vpp.",
                 error=best.error, band=best.band, printed_inputs=inputs, point=8))
     return result

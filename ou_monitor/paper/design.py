@@ -485,7 +485,7 @@ class Flight:
     var_inf: float  # Variance of the OU, V^2
 
 
-# Components that, if given, replace the load of a flight, so that its risk does not apply.
+# Components that, if given, replace the load of a flight, so the flight's risk does not apply.
 SHOWN = frozenset(('current_max', 'current_exponent', 'switching_scale', 'flutter'))
 
 

@@ -15,7 +15,7 @@ from ou_monitor.text import listed, number
 _MEASURED, _SIMULATED = 7, 1
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
             'simulation. Dashed lines: levels below which dips are counted.')
-# Fitted range that stands for a given model.
+# Value of `Agreement.fitted` if the model was given, not fitted.
 _NOTHING = (0.0, 0.0)
 
 

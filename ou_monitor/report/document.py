@@ -1,9 +1,9 @@
 """
 The report of a command as records, which `page` turns into HTML and `terminal` into text.
 
-Empty parts are left out.  Texts are ASCII; a page replaces '+-' by its sign, and 'sigma' and
-'V/sqrt(s)' in the heads of tables by symbols.  In a cell or a head, text after a line break is
-small on a page and continues the line on a terminal.
+Empty parts are left out.  Texts for a terminal are ASCII; a page replaces '+-' by its sign, and
+'sigma' and 'V/sqrt(s)' in the heads of tables by symbols.  In a cell or a head, text after a line
+break is small on a page and continues the line on a terminal.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def test_gazebo_is_a_line_and_a_constant_sag():
     # A full pack drawn by that current for the time that the model takes: to 3.5 V a cell.
     seconds = 3600.0 * c / (power / voltage)
     assert seconds == pytest.approx(1.0 / (GECKO.load.discharge * 0.4 ** 1.8), rel=0.02)
-    assert e1 < 0.0 and any('load_sag is for a constant load' in note for note in found.notes)
+    assert e1 < 0.0 and any('load_sag is the sag under' in note for note in found.notes)
 
 
 def test_ardupilot_has_charge_and_resistance():

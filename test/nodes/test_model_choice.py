@@ -81,7 +81,7 @@ def test_a_flight_is_saved_into_its_own_file_alone(tmp_path):
     path.write_text((ROOT / 'models' / 'gecko.yaml').read_text())
     path.chmod(0o640)
     choice = ModelChoice()
-    with pytest.raises(InputError, match='no model_file in force'):
+    with pytest.raises(InputError, match='no model_file in use'):
         choice.save(None, {})
     choice.check(str(path))
     model = choice.use(str(path))

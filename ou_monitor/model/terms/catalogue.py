@@ -67,7 +67,7 @@ def blamed(error: BaseException) -> tuple[str, ...]:
 
 
 def withdraw(error: BaseException) -> bool:
-    """Remove installed causes: those that raised the error, or all; False: none is installed."""
+    """Remove the installed causes that raised an error, or else all; return whether any is."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)

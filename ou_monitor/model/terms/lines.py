@@ -46,7 +46,7 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     if lag == 0.0:
         q[:, 0, 0] = q[:, 1, 1] = left
     else:
-        # Stationary covariance (11: 1, 12: -lag, 22: 1 + 2 lag^2, times std^2) less the rotated.
+        # Stationary covariance (11: 1, 12: -lag, 22: 1 + 2 lag^2, times std^2) less its rotation.
         more, mixed = 2.0 * lag * lag * std * std, 2.0 * lag * std * std * along * across
         q[:, 0, 0] = left - more * across * across - mixed
         q[:, 1, 1] = left + more * (1.0 - along * along) + mixed

@@ -61,7 +61,7 @@ class LoadDependentSigma(Term):
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
-        """Return the term with one knot moved."""
+        """Return the term with the log factor at one knot changed."""
         at = int(name.split()[1])
         factors = tuple(min(max(f + by, -_MOST), _MOST) if k == at else f
                         for k, f in enumerate(self.log_factor))
@@ -362,7 +362,7 @@ class LoadDependentNoise(Term):
         return [white, replace(white, on_sigma=0.5)] if white.at else [white]
 
     def apart(self, view: View) -> LoadDependentNoise:
-        """Return the curves, for white noise only, refitted to the scores of a model with them."""
+        """Refit the curves to the scores of a model with them, as factors on white noise only."""
         assert view.throttle is not None
         inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
             view.step, view.throttle).items()}

@@ -100,7 +100,7 @@ class Term:
     ROLE: ClassVar[Role] = Role.MEAN
     # Parameters that multiply known columns (`Role.MEAN`).
     LINEAR: ClassVar[tuple[str, ...]] = ()
-    # Positive parameters found by maximum likelihood, on a log scale (`DRIVE`, `BLOCK`, `NOISE`).
+    # Parameters found by maximum likelihood (`DRIVE`, `BLOCK`, `NOISE`), on the scale of `moved`.
     FREE: ClassVar[tuple[str, ...]] = ()
     # Prefixes of the names of the statistics that indicate this term; a leading + or - restricts
     # this to deviations of that sign.
@@ -115,9 +115,9 @@ class Term:
     # after it has found one.
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
-    # Minimum evidence, as a share of the strongest cause's evidence.
+    # Minimum evidence, as a share of the evidence of all responses of the mean together.
     LEAST_SHARE: ClassVar[float] = 0.0
-    # Share of its value before the fit that an indicating statistic may keep; 0: none may fail.
+    # Share of its initial value that an indicating statistic may keep; 0: no statistic may fail.
     MAY_LEAVE: ClassVar[float] = 0.0
     # Statistics that must not fail after the fit.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
@@ -172,7 +172,7 @@ class Term:
         return ()
 
     def objection(self, path: FloatArray, at: FloatArray) -> str:
-        """Return an objection to the offset or log power of a fit at times, s; else empty."""
+        """Return an objection to a fitted path (offset, log power) at times, s; '' for none."""
         return ''
 
     def holds(self, view: View) -> bool:

@@ -206,7 +206,7 @@ class LearnedWiener:
         try:
             found = self._best(noise, misfit)
         except np.linalg.LinAlgError:
-            # Discard the means, which are inaccurate after noise many powers of ten larger.
+            # Discard the means: noise that was many powers of ten larger made them inaccurate.
             self._sum, self._whiten = 0.0, None
             return
         if np.all(np.isfinite(found)):

@@ -8,7 +8,7 @@ The derivative is the same low-pass, applied to the slope of the input.  It does
 cutoff changes, and is exact for an input that is linear between samples.
 
 With the law `kalman`, the output comes from `learned_wiener`.  The low-pass runs in parallel, at
-the cutoff of equal lag, and replaces it while sigma is unknown.
+the cutoff of equal lag, and gives the output while sigma is unknown.
 
 Limits: the cutoff is constant within a step; frequencies above half the sample rate are aliased by
 the sampling, before the filter.

@@ -618,5 +618,5 @@ def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[fl
             math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0))
     if end <= highest:
         return end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
-    return highest, ('Within the limit up to full throttle.' if highest == 1.0 else
-                     f'No data above {highest:.2f}; within the limit up to there.')
+    return highest, ('The risk is within the limit up to full throttle.' if highest == 1.0 else
+                     f'No data above {highest:.2f}; the risk is within the limit up to there.')

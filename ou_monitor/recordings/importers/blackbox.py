@@ -91,7 +91,7 @@ def read(path: Path, request: Request) -> Log:
                      'not read.')
     table, odd = _in_time(table)
     if odd:
-        notes.append(f'{counted(odd, "frame")} dropped: the time does not fit.')
+        notes.append(f'{counted(odd, "frame")} dropped: out of order, or isolated in time.')
     columns = {name: table[:, k] for k, name in enumerate(fields)}
     facts = _facts(headers)
     if len(held) > 1:

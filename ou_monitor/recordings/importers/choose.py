@@ -171,7 +171,7 @@ def _no_voltage(path: Path, log: Log, option: str) -> str:
     if others:
         return (f'{path} has no battery voltage; choose another with {option.format(VOLTAGE)} '
                 f'NAME: {_names_of(others)}{why}')
-    return f'{path} holds no voltage{why}: there is nothing to convert'
+    return f'{path} holds no voltage{why}'
 
 
 def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:

@@ -264,7 +264,7 @@ def _names_half(rows: list[list[str]]) -> int:
 
 
 def _joined(row: list[str], names: int) -> list[str]:
-    """Join pairs of whole numbers in a row of twice as many as names, else return no cells."""
+    """Join whole numbers in pairs if a row has two for each name; else return no cells."""
     split = len(row) == 2 * names and all(map(re.compile(r'[-+]?\d+').fullmatch, row))
     return [f'{whole}.{part}' for whole, part in zip(row[::2], row[1::2])] if split else []
 

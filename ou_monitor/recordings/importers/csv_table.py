@@ -43,7 +43,7 @@ NONE = 'none'
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
 _BACK = 0.25
-# Maximum number of series that whole numbers name: MAVLink has up to nine batteries.
+# Maximum number of series whose names are whole numbers: MAVLink has up to nine batteries.
 _MOST_SERIES = 9
 # Minimum number of rows for conclusions from comparing rows, such as repeated stamps.
 _FEW_ROWS = 8
@@ -160,7 +160,7 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     if filled.any():
         t, volts, throttle, current = (one[filled] for one in (t, volts, throttle, current))
     if t.size >= _FEW_ROWS and 2 * np.unique(t).size < t.size:
-        said.append('Most rows repeat the stamp before: if evenly spaced, give --sample-interval.')
+        said.append('Most rows repeat the last stamp: if evenly spaced, give --sample-interval.')
     return RawColumns(t, volts, throttle, current, name, source, tuple(said))
 
 
@@ -316,7 +316,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
 
 
 def _has_thousands(form: Form, time: FileColumn, found: dict[str, FileColumn]) -> bool:
-    """Return whether points separate thousands: else the time falls, or volts are below 0.1."""
+    """Return whether points separate thousands: else times would fall, or volts be below 0.1."""
     pointed = [cell for row in form.rows for cell in row if '.' in cell and is_number(cell)]
     if form.delimiter not in ';\t' or form.comma or form.mark or not pointed or not all(
             re.fullmatch(r'-?[1-9]\d{0,2}\.\d{3}', cell) for cell in pointed):
@@ -509,7 +509,7 @@ def _range_of(form: Form, place: int) -> float:
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
-    """Return the only column; without a header, all that vary if the first varies least."""
+    """Return a sole column; without a header, all that vary, if the first varies least."""
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
         return places if len(places) == 1 else []
     # Constant columns are not compared.
@@ -691,7 +691,7 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
                 f"{path}: '{column}' holds several series, named in '{label}': "
                 f'{shown(some(map(printable, names), 3))}; ' + (
                     'name one with --voltage-column, or ' * bool(form.line) if words else
-                    'name a load by --throttle-column, or ') + 'keep the rows of one')
+                    'if these are a load, give --throttle-column; else ') + 'keep the rows of one')
 
 
 def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:

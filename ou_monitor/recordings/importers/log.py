@@ -38,7 +38,7 @@ RPM = 2.0 * math.pi / 60.0
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # A column of unknown kind.
 ANY = 'any'
-# Any other series, such as a gyro axis: chosen by name only.
+# Any other series, such as a gyro axis: used only if the user names it.
 SIGNAL = 'signal'
 # A gyro with its accelerometer, along the axes of `base_link`, the acceleration as specific force
 # (gravity included); the speeds of all motors.
@@ -68,7 +68,7 @@ class Series:
     values: FloatArray
     scale: str  # Conversion from the logged value
     words: str = ''  # Description
-    rank: int | None = None  # The smallest rank is the default; None: only taken by name
+    rank: int | None = None  # The smallest is the default; None: used only if the user names it
     group: str = ''  # The sensor; a voltage and a current of one sensor share it
     own_unit: str = UNKNOWN  # Unit of a signal, ``?`` when the log does not state it
 

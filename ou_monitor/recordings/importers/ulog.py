@@ -3,8 +3,8 @@ Read PX4 ULog files, with pyulog.
 
 Limits: ULog has no end mark and no checksums, so a log truncated
 between two messages looks complete.  PX4 may have low-passed the voltage
-(`BATn_V_FILT`).  The log does not say which `actuator_outputs` are motors: they
-are taken by name only.
+(`BATn_V_FILT`).  The log does not say which `actuator_outputs` are motors: one
+is used only if the user names it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ENDINGS = (('_m_s2', 'm/s^2'), ('_rad', 'rad/s'), ('_m_s', 'm/s'), ('_v', 'V'), 
            ('_rpm', 'rpm'), ('_pa', 'Pa'), ('_celsius', 'deg C'), ('_celcius', 'deg C'),
            ('_us', 'us'), ('_ms', 'ms'), ('_hz', 'Hz'), ('_meter', 'm'))
 
-# Topic, field, quantity, rank, words.  The battery comes first; rails only by name.
+# Topic, field, quantity, rank, words.  The battery comes first; a rail must be named.
 PLAIN = (
     ('battery_status', 'voltage_v', VOLTAGE, 0, 'battery'),
     ('battery_status', 'voltage_filtered_v', VOLTAGE, None, 'battery, low-passed by PX4'),

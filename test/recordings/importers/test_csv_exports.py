@@ -769,7 +769,7 @@ def test_the_lower_of_two_rows_with_one_stamp_is_kept(first, tmp_path):
 
 @pytest.mark.parametrize('header, row, words', [
     ('time_s,id,voltage', lambda k: f'{0.1 * k:.1f},{k % 2},{V[k] / (1 + k % 2)}',
-     "named in 'id': 0, 1; name a load by --throttle-column, or keep the rows of one"),
+     "named in 'id': 0, 1; if these are a load, give --throttle-column; else keep"),
     ('time_s,battery,voltage',
      lambda k: f"{0.1 * k:.1f},{('front', 'rear')[k % 2]},{V[k] / (1 + k % 2)}",
      "named in 'battery': front, rear; name one with --voltage-column, or keep"),
