@@ -63,7 +63,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
                   ) -> Composite | None:
     """Fit a model on a part; None if a law cannot be fitted."""
     # A law that has no parameters yet is given as its class, and fitted by `first`.  The fit
-    # starts from the events and offset of `known`, a model with the same laws.
+    # starts from the events and offset of `known`; with the same laws, there is one round only.
     structural = [term for term in terms
                   if isinstance(term, Term) and term.ROLE is not Role.LAW]
     laws = [term for term in terms if term.ROLE is Role.LAW]

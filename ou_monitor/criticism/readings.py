@@ -350,7 +350,8 @@ def _fill_gaps(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | N
     notes.append(
         f'Throttle is unknown at {counted(u.size - known.size, "sample")} ({number(total)} of '
         f'{number(float(t[-1] - t[0]))} s, the longest gap {number(longest)} s): the last '
-        'known value is held there' + ('' if there[0] else ', and the first one before it')
+        'known value is held there' + ('' if there[0] else
+                                       ', and the first known one at the start')
         + '. If throttle moved meanwhile, findings about throttle are wrong.')
     at = np.searchsorted(known, np.arange(u.size), side='right') - 1
     return u[known[np.maximum(at, 0)]]

@@ -52,7 +52,7 @@ _PAD = 5
 
 T = TypeVar('T')
 _LOG_TWO_PI = math.log(2.0 * math.pi)
-# Barrier above which the mean time, more than 1e150 tau, counts as infinite.
+# Barrier above which the mean time, more than 1e145 tau, counts as infinite.
 _NEVER = 26.0
 
 
@@ -155,7 +155,7 @@ class PassageTable:
 
 
 def prepare() -> PassageTable:
-    """Return the table; the first call takes tenths of a second, in any thread."""
+    """Return the table, from any thread; the first call takes tenths of a second."""
     global _table
     if _table is None:
         with _lock:

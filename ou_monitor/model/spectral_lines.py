@@ -170,7 +170,7 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
         lines, least = _search(parts, white, rate, length, where,
                                false_alarm / (levels * count), wide)
         # A line found in both passes is measured in the short pieces, because it may drift, unless
-        # it is significant only in the long pieces.
+        # it reaches FALSE_ALARM in the long pieces only.
         for line in lines:
             same = [other for other in found if abs(line.frequency - other.frequency)
                     < 2 * LOBE * other.resolution]

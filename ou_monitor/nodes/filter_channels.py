@@ -2,7 +2,7 @@
 The signals that `adaptive_filter` takes from a message and writes back.
 
 The unit of a derivative differs from its signal's (per second), so a derivative is not written
-into the field of the signal, but published in a message of another type.
+into the field of the signal, but published in a message of another type (except a bare number).
 """
 
 from __future__ import annotations

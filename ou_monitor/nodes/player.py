@@ -91,7 +91,7 @@ class Prefetch:
         self._thread.start()
 
     def fill(self) -> None:
-        """Wait until all batches or the whole source have been read."""
+        """Wait until the queue is full or the whole source has been read."""
         self._full.wait()
 
     def close(self) -> None:

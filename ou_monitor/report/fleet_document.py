@@ -88,7 +88,7 @@ def fleet_document(fleet: Fleet) -> Document:
 
 
 def answer(fleet: Fleet) -> list[str]:
-    """Return the answer: the lowest voltage, what stands out, and what was analysed."""
+    """Return the answer: ageing packs, lowest voltage, what stands out, what was analysed."""
     return [part for part in (_ageing(fleet), *sentences(fleet), _anomalies(fleet),
                               _analysed(fleet)) if part]
 
@@ -201,7 +201,7 @@ def trend_words(trend: Trend) -> str:
     """Return a drift in a sentence."""
     flights = trend.last - trend.first
     return (f'{trend.vehicle}: {trend.quantity} drifts by {_rates(trend)}, '
-            f'{change(flights * trend.slope)} over {trend.flights} flights; '
+            f'{change(flights * trend.slope)} from flight {trend.first} to {trend.last}; '
             f'{p_words(trend.p_value)}, fleet-wide {chance(trend.p_family)}.')
 
 

@@ -140,5 +140,5 @@ def test_a_periodic_load_is_no_random_switch(even):
     voltage = simulate(t, 20.0, 0.06, rng) + 5.0 - 0.05 * on
     found = discover(Recording(name='rail', t=t, voltage=voltage))
     assert [cause.name for cause in found.causes] == ['regime_switching']
-    assert ('as of a periodic load' in found.sentence) is even
+    assert ('as with a periodic load' in found.sentence) is even
     assert not even or found.verdict is Verdict.PARTLY_EXPLAINED

@@ -228,7 +228,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> St
 
 
 def _with_less_noise(view: View, share: float) -> View:
-    """Return the view for an OU with a share of the fitted OU's noise, and equal white noise."""
+    """Return the view for an OU with a share of the noise, and the same white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
@@ -341,7 +341,7 @@ _MOST = 5_000_000
 
 
 # Minimum number of complete stays in a state, and coefficient of variation below which they count
-# as even: exponential times of that number vary less with a probability of 1e-3.
+# as even: that many exponential times have a lower coefficient with a probability of 1e-3.
 _STAYS, _EVEN = 10, 0.35
 
 
@@ -447,8 +447,8 @@ class RegimeSwitching(Term):
                   if each.size >= _STAYS]
         least = min(spread, default=math.inf)
         return '' if self.states > 2.0 or least > _EVEN else (
-            'its states change at random times; in the recording, the times in one of them differ '
-            f'by only {100.0 * least:.0f} %, as of a periodic load')
+            'its states change at random times; in the recording, the stays in one state vary by '
+            f'only {100.0 * least:.0f} %, as with a periodic load')
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:

@@ -36,7 +36,8 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Number of values of a 32-bit counter; seconds per day.
 _COUNTS, _DAY = 2.0**32, 86400.0
-# No craft's pack has more V: without a unit it is mV, and whole numbers above a tenth are counts.
+# No craft's pack has more V: without a unit, larger values are mV, and whole numbers above a tenth
+# of it are counts.
 _MOST_VOLTS = 1000.0
 # A throttle without a unit is not taken for percent up to this maximum: levers give up to 5 V.
 _LEAST_PERCENT = 5.5
@@ -123,7 +124,7 @@ def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: F
 
 
 def lower_rows(t: FloatArray, volts: FloatArray) -> tuple[Picked, list[str]]:
-    """Return which rows to keep, if each stamp has two the lower ones, and notes."""
+    """Return notes and the rows to keep: the lower ones if each stamp has two."""
     first, second = (np.arange(k, t.size // 2 * 2, 2) for k in (0, 1))
     change = volts[second] - volts[first]
     if not (change.size and np.isfinite(volts).all() and (t[first] == t[second]).all() and (
@@ -131,7 +132,7 @@ def lower_rows(t: FloatArray, volts: FloatArray) -> tuple[Picked, list[str]]:
         return slice(None), []
     return np.append(np.where(change < 0.0, second, first), np.arange(2 * first.size, t.size)), [
         'Each stamp has two rows, as in an envelope: the row of the lower voltage was kept; if '
-        'they are in turn, give --sample-interval.']
+        'the two are successive samples, give --sample-interval.']
 
 
 def in_si(path: Path, quantity: str, column: FileColumn, values: FloatArray, given: str | None,
@@ -154,8 +155,8 @@ def in_si(path: Path, quantity: str, column: FileColumn, values: FloatArray, giv
             values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
             if known.size and np.nanmedian(values) < 0.5 * THROTTLE_UNITS[unit][0]:
                 raise InputError(f"{path}: '{column.name}' is not a pulse in {unit}: half of its "
-                                 f'values are below {np.nanmedian(values):.4g}; give the unit '
-                                 'that it has, or none')
+                                 f'values are below {np.nanmedian(values):.4g}; give its unit '
+                                 'by --throttle-unit')
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
