@@ -211,8 +211,8 @@ U0 = 5.0
 ALPHA = 63.0
 
 # Noise intensity by throttle, V/sqrt(s).  10 % and 40 % are from Table 2; 5 % is from its Vrms of
-# 9.38 mV (Table 1).  With the motors off the paper prints "~0", so the Vrms is at most half an
-# oscilloscope step of 9.375 mV, which is used here.
+# 9.38 mV (Table 1).  With the motors off the paper prints "~0", so the Vrms is at most half of the
+# oscilloscope's step of 9.375 mV; this half, 4.7 mV, is used here.
 SIGMA = {0.0: 4.7e-3 * math.sqrt(2.0 * ALPHA), 0.05: 9.38e-3 * math.sqrt(2.0 * ALPHA),
          0.10: 0.3156, 0.40: 0.632}
 

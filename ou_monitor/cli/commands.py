@@ -421,13 +421,13 @@ _FLEET = Command(
      Option('--insecure', action='store_true',
             help='allow a scheduler on another machine without TLS'),
      Option('--vehicle-from', metavar='REGEX',
-            help='regular expression whose first group finds the vehicle in the path, if the '
-            'metadata do not (default: the folder is the vehicle)'),
+            help='regular expression for the path, whose first group (or whole match) is the '
+            'vehicle, if the metadata do not name it (default: the folder is the vehicle)'),
      Option('--discover', action='store_true',
             help='also search for causes; takes a few seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),
-     *estimate('count dips below this voltage, V, and give their risk'), *TOPICS, *COLUMNS,
-     JSON, FORCE),
+     *estimate('count dips below this voltage, V, and compute the risk of one'), *TOPICS,
+     *COLUMNS, JSON, FORCE),
     ('logs/ --output fleet --cells 4', 'logs/ --output fleet --vehicle-from "(uav[0-9]+)"'))
 
 _LIVE = Command(

@@ -99,7 +99,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         notes.append('the resistance is computed from the settled fall at '
                      f'{"the usual load" if target == "gazebo" else "full throttle"}; analyze '
                      'gives the resistance after 1 s')
-    notes += [f'load_sag is as at the start: in the model, it grows by {t.growth:.3g} V/s at '
+    notes += [f'load_sag keeps its initial value: in the model, it grows by {t.growth:.3g} V/s at '
               'full throttle' for t in model.terms
               if target != 'px4' and isinstance(t, LoadSag) and t.growth]
     if target != 'px4' and math.isnan(n.stated):

@@ -1,7 +1,7 @@
 """
 Compare a recording with simulations of it: measures, records, verdict.
 
-Voltage levels lie halfway between two codes of the ADC, so that no reading equals a level.  Dips
+The two low levels lie halfway between two codes of the ADC, so that no reading equals them.  Dips
 below a level are counted with hysteresis, as in `supply_facts`.
 
 The score of a number is its distance from the median, in half-widths of a band that is estimated

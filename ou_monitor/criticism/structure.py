@@ -2,7 +2,7 @@
 The Gaussian part of a model: mean, poles, intensities and noise, fitted together.
 
 A model is a list of terms: `Role.MEAN` terms are columns of a regression, `DRIVE` terms change
-alpha and sigma along the recording, `BLOCK` terms add states, and `NOISE` terms add white errors.
+alpha, sigma and white noise with throttle, `BLOCK` terms add states, `NOISE` terms white errors.
 `LAW` terms (the distribution of the innovations) are fitted in `composite`; events that they find
 enter here as extra variance at their samples.
 """

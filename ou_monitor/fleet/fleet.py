@@ -201,7 +201,7 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
 
 
 def _raise_guesses(flights: Sequence[dict[str, Any]]) -> None:
-    """Replace guessed cells by the vehicle's largest number that fits the flight's voltage."""
+    """Replace guessed or unknown cells by the vehicle's largest number that fits the voltage."""
     known = sorted({one['cells'] for one in flights if one['cells']}, reverse=True)
     for one in flights:
         found = next((cells for cells in known if fits(one['full_v'], cells)), 0)

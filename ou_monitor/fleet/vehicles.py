@@ -1,9 +1,9 @@
 """
 Vehicle and flight number of a recording.
 
-The vehicle is named by the metadata of the recording, else by a pattern in its path, else by its
-folder.  Recordings are compared within a vehicle only, and not at all if the vehicle is unknown.
-Flights are ordered by date; the date comes from the stamps, the log's header or the file's name.
+The vehicle is named by the metadata of the recording, else by a pattern in its path, or, if no
+pattern is given, by its folder.  Recordings are compared within a vehicle only.  Flights are
+ordered by date; the date comes from the stamps, the log's header or the file's name.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ class LoadStart:
     discharge: float  # Charge drawn per time at full load, 1/s.
     # ln of the variance, V^2, of white noise: constant, and coefficients of ripple and sqrt|du|.
     log_variance: tuple[float, float, float]
-    flown: tuple[float, float]  # 10 % and 90 % quantile of throttle.
+    flown: tuple[float, float]  # 10 % and 90 % quantile of throttle; 2 % and 98 % if those agree.
     delay: float = 0.0  # Delay of the recorded throttle behind the voltage, s.
     resistance: float = 0.0  # Ohm; 0: no measured current affects the voltage.
     resistance_se: float = 0.0  # Its standard error, Ohm.

@@ -4,8 +4,8 @@ The node `adaptive_filter`: low-pass a topic, with a cutoff that follows the noi
 doc/messages.md lists its topics:
 
 - `input`: a type in `filter_channels.CHANNELS`, or with `input.field` any installed type;
-- `state` of the estimator, if published: sigma's error, alpha, throttle, and whether the
-  estimate is usable;
+- `state` of the estimator, if published: sigma's error, alpha, throttle, noise under load, and
+  whether the estimate is usable;
 - `throttle` and `rpm`, if `notch.count` is above 0: for the notches, which come before the
   low-pass; without `throttle`, the throttle in `state` is used;
 - `~/output`: has type, stamp and frame of the input, except that a derivative is a

@@ -35,7 +35,7 @@ from ou_monitor.report.document import (
 from ou_monitor.report.svg import Curve, extremes, Plot
 from ou_monitor.stream.files import open_regular
 
-# Maximum points of a plot that is embedded in full; with it, an hour at 1 kHz takes 1.5 MB.
+# Maximum points of a plot that is embedded in full; an hour at 1 kHz then takes 1.5 MB.
 MOST = 150_000
 _EXACT = 4096  # Points up to which nothing is rounded
 # Resolution of a long x column: grid steps per median step.

@@ -91,7 +91,7 @@ def test_a_sag_that_grows_is_exported_as_it_begins(target):
     other = export(steady, target, throttle=HOVER, rate=100.0, full_current=60.0)
     assert (found.text, found.model.terms) == (other.text, other.model.terms)
     assert set(found.notes) - set(other.notes) == {
-        'load_sag is as at the start: in the model, it grows by -0.004 V/s at full throttle'}
+        'load_sag keeps its initial value: in the model, it grows by -0.004 V/s at full throttle'}
 
 
 def test_each_term_left_out_is_named_with_its_size():

@@ -35,7 +35,7 @@ class Role(enum.Enum):
     EXACT = enum.auto()
     # A sum of known columns with coefficients.
     MEAN = enum.auto()
-    # Changes alpha or sigma with a measured input.
+    # Changes alpha, sigma or the white noise with a measured input.
     DRIVE = enum.auto()
     # Adds states to the linear system.
     BLOCK = enum.auto()

@@ -18,7 +18,7 @@ from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # Minimum number of samples for any finding.
 _ENOUGH = 64
-# Minimum number of different steps, all whole multiples of one, that prove the grid of an ADC;
+# Minimum number of different steps, multiples of a common step, that prove the grid of an ADC;
 # fewer may be chance.
 _FEWEST_STEPS = 3
 # Share of adjacent samples that differ below which the ADC counts as coarse.

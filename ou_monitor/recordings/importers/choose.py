@@ -63,7 +63,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     if second is None and current is None and (
             held := [one for one in _series_of(log, CURRENT) if not one.silent]):
         notes.append('No current clearly belongs to this voltage: ' + _names_of(held)
-                     + f'; none taken ({option.format(CURRENT)} NAME).')
+                     + f'; none is used ({option.format(CURRENT)} NAME names one).')
     usable: dict[str, Series] = {}
     dropped: dict[str, list[str]] = {}
     for one in (volts, first, second):

@@ -255,7 +255,7 @@ def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[lis
 
 
 def _names_half(rows: list[list[str]]) -> int:
-    """Return the number of names above rows of twice as many whole numbers, else 0."""
+    """Return the number of names if the rows below hold two whole numbers for each, else 0."""
     # Unquoted decimal commas between commas split each number in two.
     filled = [row for row in rows if any(row)]
     first = next((k for k, row in enumerate(filled) if _joined(row, len(row) // 2)), 0)
@@ -699,7 +699,7 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
 
 def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stated: str,
             good: npt.NDArray[np.bool_] | None, left_out: list[str] | None) -> FloatArray:
-    """Return cells as numbers (where: the place of one in words; stated: their unit)."""
+    """Return cells as numbers (where: states the place of a cell; stated: their unit)."""
     # A bad cell raises InputError, or with `good` marks its line there and appends the error once.
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
