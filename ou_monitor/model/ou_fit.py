@@ -83,8 +83,8 @@ _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 _LOOKS, _NEAR = 40, 0.05
 # Draws in each round, over all maxima; rounds; minimum share of the draws for a maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
-# Maximum excess of a minimum at another alpha over the lowest cost, nats: to be refined, and then
-# to be kept (e^-6 of the likelihood does not affect a 95 % interval).
+# Maximum excess over the lowest cost, nats, at which a minimum at another alpha is refined, and at
+# which it is then kept (e^-6 of the likelihood does not affect a 95 % interval).
 _REFINED, _RIVAL = 10.0, 6.0
 # A window is imprecise above this standard deviation of ln(alpha) (from the curvature at the
 # maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.

@@ -200,7 +200,7 @@ class FilterSettings:
         'with coupling; 0: the noise at sigma_ref and fmax.', 0.0, 1.0e12)
     n0: float = _parameter(
         0.0, 'White measurement noise for kalman, unit^2/Hz, two-sided: variance of a '
-        'sample over the sample rate.', 0.0, 1.0e12)
+        'sample divided by the sample rate.', 0.0, 1.0e12)
     alpha: float = _parameter(
         63.0, 'Relaxation rate of the supply until the estimator provides one, 1/s.',
         1.0e-6, 1.0e9)

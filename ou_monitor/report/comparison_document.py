@@ -36,8 +36,8 @@ def comparison_document(found: Agreement, seen: Overview) -> Document:
                          folded=True)],
         Notes.of(found.notes),
         Text(f'{found.seeds} simulations with the stamps, throttle and ADC steps of the '
-             f'recording. {100.0 * found.p_value:.0f} % of them (the recording included) deviate '
-             f'at least as much as the recording; at {100.0 * LEVEL:g} % or less the recording is '
+             f'recording. Of these and the recording, {100.0 * found.p_value:.0f} % deviate at '
+             f'least as much as the recording; at {100.0 * LEVEL:g} % or less the recording is '
              'reported to differ.',
              legend=True)]
     return Document('Compared with its simulation', subject, [*seen.beware, *_answer(found)],

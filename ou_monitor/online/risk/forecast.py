@@ -12,8 +12,8 @@ mean mu, noise s and error r of `lowest`, by least squares with forgetting; e ha
 distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2 + k2 r^2.
 
 Each law is mixed with a wider law, whose weight is the share of horizons that contradict the law
-(rule of succession).  A horizon counts with the probability that the law was wrong in it, and if
-horizons overlap, with step / horizon.  For first passage, the other method takes the place of the
+(rule of succession).  A horizon counts by the probability that the law was wrong in it, times
+step / horizon if horizons overlap.  For first passage, the other method takes the place of the
 wider law.  For a given throttle, the wider law initially has the width of the excursions, but at
 most `_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
 irrelevant to idling.  This width grows if the contradicting voltages are farther than the width
