@@ -112,7 +112,7 @@ def test_holes_of_throttle_are_held_and_measured():
     assert '35 samples (0.340 of 0.990 s, the longest gap 0.200 s)' in notes
     assert 'and the first known one at the start' in notes
     raw[:10] = 0.2
-    assert 'first one before it' not in throttle(raw)[1]
+    assert 'first known one at the start' not in throttle(raw)[1]
     assert throttle(np.full(9, math.nan)) == (None, '')
 
 
