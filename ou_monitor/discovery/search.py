@@ -352,7 +352,8 @@ def _try_ac_coupling(fitter: Fitter, search: Search) -> None:
     # Behind a coupling, even a trend appears to relax.
     if fit is None or is_trend(fitter.samples, fit):
         return
-    gain = fitter.evidence(fit) - fitter.evidence(composite)
+    # The corner comes from the search for the time constant, whose penalty it must pay too.
+    gain = fitter.evidence(fit) - fitter.evidence(composite) - LoadTransient.SEARCH
     names = [term.NAME for term in means]
     if abs(gain) < decision.TIE:
         for name in names:
