@@ -96,4 +96,4 @@ def outside_words(name: str, start: float | None, end: float | None, length: flo
 def part_words(start: float | None, end: float | None) -> str:
     """Return the note that only a part was read."""
     return (f'Only the part {span_words(start, end)} of the recording was read; times in the '
-            'report count from its start.')
+            'report count from the start of this part.')

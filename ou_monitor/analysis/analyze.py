@@ -1,9 +1,9 @@
 """
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-`SupplyMonitor` processes the recording as it would in flight, so that command and node agree; this
-part needs no constant throttle, and the limits of the monitor apply.  The risk is for the state at
-the end of the recording, and NaN at throttles 0.1 or more above the highest flown.
+For risk and sliding estimates, `SupplyMonitor` processes the recording as in flight, so that
+command and node agree; they need no constant throttle, and have the monitor's limits.  The risk is
+for the state at the end, and NaN at throttles 0.1 or more above the highest flown.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """
@@ -51,7 +51,7 @@ class Analysis:
     by_throttle: ByThrottle  # Risk over throttle
     sliding: Sliding  # Estimates and risk of the node over time
     quality: tuple[QualityItem, ...]  # Cautions about the numbers, worst first
-    brownout_default: bool  # Whether no voltage was given: the node's default on a 5 V rail
+    brownout_default: bool  # Whether the limit is the node's default, because none was given
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise
     craft: Craft  # Cells, and a comparison with known craft

@@ -48,7 +48,7 @@ def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentPars
     """Return the parser."""
     parser = Parser(
         prog=PROGRAM, allow_abbrev=False,
-        description='Ornstein-Uhlenbeck statistics of UAV supply rails, offline.',
+        description='Ornstein-Uhlenbeck statistics of UAV supply rails.',
         epilog=f"'{PROGRAM} COMMAND --help' shows the options of a command.")
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     subparsers = parser.add_subparsers(

@@ -43,8 +43,8 @@ CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
 # Total filter time after which kinds whose fit takes seconds are no longer tried, s.  For BROAD
-# kinds it is doubled: a spectrum shows beforehand whether they gain, and when they were left out,
-# the slow residual of a response to throttle halved the fitted alpha.
+# kinds it is doubled: a spectrum shows beforehand whether they gain, and without them a slow
+# residual of the response to throttle can halve the fitted alpha.
 MOST_COST = 10.0
 # Limit of a statistic: by theory, any of 70 exceeds it by chance in 1 of 2300 recordings; in
 # simulations, it was 3 of 8700.
@@ -170,7 +170,7 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
     # real flight.  Then a latent cause is tested by its own signs only, relative to their values
     # with the measured causes alone (`before`) or just before its acceptance (`before_accepted`,
     # by name), since a larger effect may have hidden them.  Without measured causes, latent ones
-    # are tested by all statistics, because the effect may not be in the catalogue.
+    # that have no MAY_LEAVE are tested by all statistics: the effect may be none of the catalogue.
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)
 

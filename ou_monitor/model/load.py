@@ -10,8 +10,8 @@ dh = (sag/V) dq - h dt / 120 s,
 with u throttle, E(s) of `open_circuit`, h Ohmic heat, and LP(x, tau) a low-pass of order 1.
 
 The start values (`LoadStart`: the response to throttle, known at take-off) come from one craft and
-one pack on one day; the filter widens their errors by the scatter between packs.  They contain no
-level, because the charge at take-off is unknown.
+one pack on one day; the filter widens their errors by the scatter between packs.  They set no
+level for the next flight, because its charge at take-off is unknown.
 """
 
 from __future__ import annotations

@@ -222,7 +222,7 @@ class EstimatorNode(MonitorNode):
         if self._send_clock is not None and self._send_clock.settled > self._settled:
             # Earlier messages, perhaps also some of this poll, have times on another time line.
             self._settled = self._send_clock.settled
-            self._stream.reset('messages that came in bursts are from a steady source')
+            self._stream.reset('the source is steady: messages that came in bursts get new times')
             ends = np.full(ends.size, math.nan)
         held = self._stream.take_voltages(
             ends, column.stamped, column.counts, column.values, messages.arrived,

@@ -267,9 +267,9 @@ def read_fields(
     """
     Return fields of a bag in the order of the file, at least to `end_ns`, ns.
 
-    `beside` names a second field to read from the same messages. For each message that cannot be
-    decoded, `broken` gets an item, of which the first states the reason; if `broken` is None, such
-    a message raises InputError.
+    `beside` names a second field to read from the same messages. `broken` gets one item for
+    each message that cannot be decoded, the first with the reason; if `broken` is None, such a
+    message raises InputError.
     """
     def reader_of(spec: FieldSpec, second: FieldSpec | None) -> FieldReader:
         def refuse(log_time: int, why: str) -> None:

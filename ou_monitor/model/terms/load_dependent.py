@@ -362,7 +362,7 @@ class LoadDependentNoise(Term):
         return [white, replace(white, on_sigma=0.5)] if white.at else [white]
 
     def apart(self, view: View) -> LoadDependentNoise:
-        """Refit the curves to the scores of a model with them, as factors on white noise only."""
+        """Refit the curves, as factors on white noise only, to the scores of their model."""
         assert view.throttle is not None
         inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
             view.step, view.throttle).items()}

@@ -110,8 +110,8 @@ class Tone(Term):
 
 def lines_of(view: View) -> tuple[Line, ...]:
     """Return the lines of the residual, strongest first."""
-    # Include the held-out part, because a line may begin late.  This is fair, because the
-    # frequency is searched for, not fitted, and a penalty covers the search.
+    # Include the held-out part, because a line may begin late.  A penalty covers the
+    # search for its frequency.
     grid = on_grid(view.at, view.z)
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED, wide=True).lines
 

@@ -62,7 +62,7 @@ _LAGS, _EVEN = 24, 0.5
 _JITTER = 0.1
 # Tolerance for rounded stamps at the edge of the window, as a share of the window.
 _ROUNDING = 1e-6
-# Share of their mean square below which the variance of increments shows that the voltage is a
+# If the variance of the increments is below this share of their mean square, the voltage is a
 # ramp.
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
@@ -321,8 +321,8 @@ class SlidingEstimator:
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
         # Also report a trend if the voltage drifts faster than a random walk with these
-        # increments: if it does not return within the window, the fit may take any drift for
-        # chance.  Increments over the longest lag reveal movements in one direction.  Skip this if
+        # increments would: if the voltage does not return, the fit may take any drift for chance.
+        # Increments over the longest lag reveal movements in one direction.  Skip this if
         # throttle moves, because the sag is still in these increments.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):

@@ -174,8 +174,8 @@ class SpectralLikelihood:
         """Return the spectra of OU and noise in units of sigma^2, shape (k, bins)."""
         gamma = np.array([arma.block_autocovariance(math.exp(x), self.m) for x in log_a.tolist()])
         a = np.exp(log_a)
-        # Different block means have the covariances of an OU of variance `size`, but each has less
-        # variance.
+        # The covariance of two block means is that of an OU of variance `size`; the variance of
+        # one block mean is less.
         size = gamma[:, 1] * np.exp(a)
         white = gamma[:, 0] - size + _SMALL * np.expm1(z)
         return np.asarray(self.step * (
@@ -397,7 +397,7 @@ def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: Floa
 
 # Maximum number of samples for which the exact likelihood is used.
 MOST = 4096
-# Minimum share of the variance of time that the load leaves unexplained, for fitting a trend.
+# A trend is fitted if the load leaves at least this share of the variance of time unexplained.
 _APART = 1e-5
 # Number of samples averaged into one sample of a coarser grid; minimum number of samples on that
 # grid.

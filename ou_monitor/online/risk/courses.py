@@ -4,7 +4,7 @@ The last minutes of a flight, possible courses of throttle, and the lowest volta
 doc/risk.md has the formulas for the lowest voltage (step 1), the pilot's future throttle (3), and
 the excursions (4).
 
-A course is throttle that jumps to a peak, then to another value.  Its samples form four groups:
+A course is throttle that goes to a peak, then to another value.  Its samples form four groups:
 during the inrush, in the two halves of the remaining peak, and after the peak.  Limits: within a
 group, the mean path counts as constant; samples of noise are independent, as in the load filter.
 

@@ -27,7 +27,7 @@ THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'm
 PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit in THROTTLE_UNITS}
 # Largest values of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
 _STICKS = (1024, 10000, 32768)
-# Ends of the stick in DJI's flight logs, whose columns CsvView and PhantomHelp name.
+# Ends of the stick in DJI's flight logs (with the column names of CsvView and PhantomHelp).
 _DJI = '364:1684'
 # Usual maximum step and span of a recording, s; an unstated unit of time is taken to be the
 # coarsest one within both.
@@ -39,7 +39,7 @@ _COUNTS, _DAY = 2.0**32, 86400.0
 # No craft's pack has more V: without a unit, larger values are mV, and whole numbers above a tenth
 # of it are counts.
 _MOST_VOLTS = 1000.0
-# A throttle without a unit is not taken for percent up to this maximum: levers give up to 5 V.
+# A throttle without a unit is percent only above this maximum: a lever's voltage reaches 5 V.
 _LEAST_PERCENT = 5.5
 
 
@@ -124,7 +124,7 @@ def stamps_of(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: F
 
 
 def lower_rows(t: FloatArray, volts: FloatArray) -> tuple[Picked, list[str]]:
-    """Return notes and the rows to keep: the lower ones if each stamp has two."""
+    """Return the rows to keep (the lower ones if each stamp has two), and notes."""
     first, second = (np.arange(k, t.size // 2 * 2, 2) for k in (0, 1))
     change = volts[second] - volts[first]
     if not (change.size and np.isfinite(volts).all() and (t[first] == t[second]).all() and (
