@@ -44,7 +44,8 @@ _KNEE, _KNEE_SLOPE = 0.079, 1.2
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
-# Time constant with which a pack cools, s (60 and 120 fit the recordings equally well).
+# Time constant with which a pack cools, s (60 and 120 fit the nine flights of
+# doc/results/compare_flights.md equally well; nazgul and gecko were worse without cooling).
 _COOLING = 120.0
 
 

@@ -49,10 +49,11 @@ _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # Time constants, s, of the band in which throttle is tried as a further regressor, and minimum
 # share of its variance that current leaves unexplained.  Smaller shares are due to rounding or lag
 # of the current (up to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x); shares of
-# 0.007 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and
+# 0.005 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and
 # regbot_28, 62 and 81.
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
-# Exponents of throttle tried for that regressor.
+# Exponents of throttle tried for that regressor: the median of the prior in `load_fit`, and about
+# two of its deviations either way.
 _POWERS = np.array([1.4, 1.6, 1.8, 2.0, 2.2])
 # Time for which the last throttle or current is held if the present one is unknown, s.
 UNKNOWN_HELD = 1.0

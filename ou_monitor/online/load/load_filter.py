@@ -406,7 +406,7 @@ class LoadFilter:
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
             self._flown[1:, int(u * BINS + 0.5)] += share * block.n, share * square
             if du < EQUAL:
-                self._contrasts.hear(u, share * block.n, share * square * min(
+                self._contrasts.take_noise(u, share * block.n, share * square * min(
                     1.0, CLIP ** 2 / max(score * score, 1.0)))
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)

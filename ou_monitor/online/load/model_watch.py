@@ -114,7 +114,7 @@ class LoadContrasts:
         # For each bin of throttle: number of samples, and sum of squared residuals, V^2.
         self._noise = np.zeros((2, BINS + 1))
 
-    def hear(self, throttle: float, samples: float, square: float) -> None:
+    def take_noise(self, throttle: float, samples: float, square: float) -> None:
         """Take the number of samples at a steady throttle, and their squared residuals, V^2."""
         self._noise[:, int(throttle * BINS + 0.5)] += samples, square
 
