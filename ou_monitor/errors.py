@@ -1,5 +1,5 @@
 """
-Errors: `InputError` for mistakes of the user, and hints for its text.
+`InputError` for mistakes of the user, and hints for its message.
 
 A bug of the caller raises `ValueError` with the value and its unit.  A mistake that the *user* can
 correct (a file, a topic, a key in a YAML file) raises `InputError`; its text is the one line that
@@ -15,7 +15,7 @@ import itertools
 
 from ou_monitor.text import printable
 
-# Maximum number of valid words to search for a hint (a table may have many columns), and to list.
+# Maximum number of valid words searched for a hint (a table may have many columns), and listed.
 _MOST_CHOICES, _MOST_SHOWN = 1000, 60
 
 
@@ -39,7 +39,7 @@ class InputError(Exception):
     """
 
     def __init__(self, text: str) -> None:
-        """Join the text to one printable line."""
+        """Join the lines of the text to one printable line."""
         super().__init__(printable(' '.join(str(text).splitlines())))
 
 

@@ -1,8 +1,4 @@
-"""
-A finding in words: verdict, causes, gains, remaining discrepancies, and what would settle them.
-
-`cause_rows` returns the rows of the table of causes.
-"""
+"""A finding in words: verdict, causes, gains, remaining discrepancies, helpful recordings."""
 
 from __future__ import annotations
 
@@ -39,7 +35,7 @@ _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
     ('band', 'the spectrum has too much or too little power in some band'),
     ('line', 'the spectrum has a line'),
-    ('order line', 'a line follows throttle'),
+    ('order line', 'the frequency of a line follows throttle'),
     ('skewness', 'prediction errors are skewed'),
     ('kurtosis', 'prediction errors have tails that are too heavy or too light'),
     ('tails', 'there are too many outliers'),
@@ -64,17 +60,17 @@ _PLAIN = ((
 
 
 def plain_words(statistic: str) -> str:
-    """Return the meaning of a statistic outside its band."""
+    """Return what it means that a statistic lies outside its simulated band."""
     fits = [(len(sign), text) for sign, text in _PLAIN if statistic.startswith(sign)]
     return max(fits)[1] if fits else statistic
 
 
-# Longest list of numbers, or of tones with all parameters, that is printed.
+# Maximum number of values in a printed list, and of tones printed with all their parameters.
 _LISTED = 6
 
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
-    """Return the estimates of a term with units and errors; omit unknown and unused ones."""
+    """Return the estimates of a term with units and errors; omit unknown and unused parameters."""
     curves = term.factors()
     known = {name: value for name, value in term.values().items()
              if se.get(name) != math.inf and value != term.usual().get(name, 0.0)
@@ -93,7 +89,7 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
 
 
 def curve_text(at: Sequence[float], factors: Sequence[float]) -> str:
-    """Return the points of a curve."""
+    """List the points of a curve."""
     return ', '.join(f'{number(factor)} at {number(x)}' for x, factor in zip(at, factors))
 
 
@@ -127,7 +123,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
             alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
             chance: float = math.nan) -> str:
     """Return an explanation of a cause: meaning, estimate, gain (nats) and remedy."""
-    # If several terms share a row, use the words of their kind, not of one term.
+    # If several terms share a row, use the texts of their class, not of one term.
     about = type(term) if together > 1 else term
     parts = [about.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
@@ -139,8 +135,8 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     if alternatives:
         separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
                     for name in (term.NAME, *alternatives)]
-        parts.append(f'This recording cannot separate it from {listed(list(alternatives))}; this '
-                     f'would: {"; ".join(dict.fromkeys(separate))}.')
+        parts.append(f'This recording cannot separate it from {listed(list(alternatives))}. To '
+                     f'separate them: {"; ".join(dict.fromkeys(separate))}.')
     parts.append(about.REMEDY)
     return ' '.join(part for part in parts if part)
 
@@ -153,8 +149,8 @@ def left_out_note(count: int, scored: int) -> str:
 
 def coupling_note(alpha: float, duration: float) -> str:
     """Return for which rails an AC coupling is not ruled out (alpha in 1/s, duration in s)."""
-    # Evidence for an AC coupling is 0.24 alpha T nats (alpha: rate of the rail behind it; T:
-    # duration).
+    # A recording of duration T gives 0.24 alpha T nats of evidence for an AC coupling, where alpha
+    # is the rate of the supply.  Below 6 nats, the coupling is not ruled out.
     slowest = 0.24 * duration / 6.0
     return (f'If the supply itself takes more than {number(slowest)} s to relax, the '
             'relaxation found could come from an AC-coupled instrument (a high-pass at '
@@ -170,8 +166,8 @@ def no_relaxation_note(alpha: float, step: float) -> str:
 
 def coupling_found(duration: float) -> str:
     """Return what would confirm an AC coupling that was found."""
-    return (f'An AC coupling was found in a recording of {number(duration)} s; its evidence grows '
-            'by 0.24 nats in each relaxation time. A DC-coupled recording would settle it.')
+    return (f'An AC coupling was found in a recording of {number(duration)} s. The evidence is '
+            '0.24 nats per relaxation time; a DC-coupled recording would settle it.')
 
 
 def remaining_words(left: Sequence[Criticism]) -> str:
@@ -230,17 +226,17 @@ def _gain(found: Finding, why: str) -> str:
 
 def collinear_note(inflation: float, limit: float) -> str:
     """Return a note that sag and drift are hard to tell apart."""
-    return ('Throttle follows the time like a staircase or a ramp (variance inflation '
+    return ('Throttle changes with time like a staircase or a ramp (variance inflation '
             f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
             'apart, so the errors of the response are larger. Return to a low throttle between '
             'the steps.')
 
 
 def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.nan) -> str:
-    """Return the gain in a sentence, and if it is not significant, the p of a named cause."""
+    """Return the gain in words, and if it is not significant, why the cause is still named."""
     named = '' if math.isnan(chance) else (
         f' Named because it explains the whole recording better ({p_words(chance)}).'
-        if chance <= CHANCE else ' Named because without it the OU would follow the trend.')
+        if chance <= CHANCE else ' Named because without it the OU term would fit the trend.')
     if not math.isfinite(gain):
         return f'Its gain cannot be measured on this recording{f": {why}" if why else "."}{named}'
     size = f'{gain_text(gain, gain_se)} mnat per sample'
@@ -276,7 +272,7 @@ class CauseRow:
 
 def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
     """Return the rows of the table of causes."""
-    # Compared as text, because NaN is not equal to itself.
+    # Compare numbers as text, because NaN is not equal to itself.
     groups: dict[tuple[str, ...], list[Cause]] = {}
     for cause in causes:
         key = (cause.name, repr(cause.gain), repr(cause.gain_se), _chance(cause))
@@ -308,7 +304,7 @@ def _chance(cause: Cause) -> str:
 
 
 def _explanation(group: Sequence[Cause]) -> str:
-    """Return the explanation of the first, with the estimates of all."""
+    """Return the explanation of the first cause, with the estimates of all causes."""
     first = group[0]
     if len(group) == 1:
         return first.explanation
@@ -321,7 +317,7 @@ def _explanation(group: Sequence[Cause]) -> str:
 
 
 def _tones(terms: Sequence[Term]) -> str:
-    """Return many tones by their frequencies, harmonics together; empty for a few."""
+    """List tones by frequency, harmonics together; return '' for at most `_LISTED` tones."""
     tones = [term for term in terms if isinstance(term, Tone)]
     if len(tones) <= _LISTED:
         return ''
@@ -387,18 +383,18 @@ def plain(text: str) -> str:
 
 
 def by_load(text: str, load: str) -> str:
-    """Return a text with the word throttle replaced by the load, such as current."""
+    """Replace the word throttle in a text by the name of the load, such as current."""
     return text if load == 'none' else re.sub(r'\b([Tt])hrottle\b', lambda found: (
         load.capitalize() if found[1] == 'T' else load), text)
 
 
 def plain_name(term: Term) -> str:
-    """Return the plain name of a cause; it states the inputs of the cause's curves."""
+    """Return the plain name of a cause, which says whether throttle or its changes matter."""
     name, curves = PLAIN_NAMES.get(term.NAME, term.NAME), term.factors()
     return name if not curves or 'throttle' in curves else name.replace(
         'throttle', 'changes of throttle')
 
 
 def both_names(name: str, what: str = '') -> str:
-    """Return the plain name of a cause (by default the usual one), and its name in code."""
+    """Return a cause's plain name (`what`, else the usual one), and its name in code."""
     return f'{what or PLAIN_NAMES[name]} ({name})' if name in PLAIN_NAMES else name

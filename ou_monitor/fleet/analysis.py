@@ -30,17 +30,17 @@ class Options:
 
     levels: tuple[float, ...] | None = None  # Throttles of the load levels; None: detect them
     window: float = 2.0  # Window of the sliding estimate, s
-    # Voltage, V, and horizon, s, of the risk; a voltage of NaN leaves the risk unknown.
+    # Voltage, V, and horizon, s, of the risk; if the voltage is NaN, the risk is unknown.
     brownout_voltage: float = NAN
     brownout_horizon: float = 5.0
     cells: int = 0  # Cells in series; 0: from the log, else a guess
     # Arguments of `read_recording`.
     msg_config: str | None = None
-    msg_config_hash: str = ''  # Of the file: if it changed, the recordings are analysed again
+    msg_config_hash: str = ''  # Hash of that file; if it changes, recordings are analysed again
     voltage_topic: str | None = None
     throttle_topic: str | None = None
     columns: CsvColumns | None = None
-    # Whether to read the intact part of damaged bags; CSVs are always read without bad lines.
+    # Whether to read the intact part of damaged bags; bad lines of CSVs are always skipped.
     partial: bool = False
     discover: bool = False  # Whether to search for causes: some seconds per recording
     seed: int = 0

@@ -1,9 +1,9 @@
 """
-Find recordings: files, bags, and both in folders.
+Find recordings: files, bags, and folders that contain them.
 
 Limits: links to folders are not followed, and hidden folders are skipped.  A FIFO, a device or a
 broken link with the name of a recording counts as an unreadable recording.  Two recordings are
-duplicates if all bytes of their data are equal; a recompressed copy is not a duplicate.
+duplicates if all bytes of their data are equal; so a recompressed copy is not a duplicate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ou_monitor.text import printable
 
 # Endings of autopilot logs; the first bytes decide whether a file is one.
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
-# Endings shared by other files, which are skipped without a note.
+# Endings that are common elsewhere: such files are skipped without a note if they are no logs.
 _COMMON = ('', '.log', '.txt')
 # Files that are noted as skipped: what they are, and why.
 _CSV = '.csv file', 'without columns of time and voltage'
@@ -109,7 +109,7 @@ def _candidates(root: Path, left_out: Path | None, closed: list[str]) -> Iterato
 
 
 def _kind(path: Path) -> tuple[str, str] | None:
-    """Return None for a recording, else what is skipped and why; empty texts: without a note."""
+    """Return None for a recording, else what is skipped and why (empty texts: no note)."""
     kind = path.suffix.lower()
     if os.path.isdir(path) or kind == '.mcap':
         return None
@@ -180,7 +180,7 @@ def _source(path: Path) -> FoundRecording:
 
 def duplicates(sources: Sequence[FoundRecording],
                progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
-    """Return each duplicate with its original, the oldest of the equal ones (progress 0..1)."""
+    """Return duplicate -> original: the oldest recording with equal data (progress: 0..1)."""
     sizes: dict[int, list[FoundRecording]] = {}
     for source in sources:
         if source.size:

@@ -30,7 +30,7 @@ from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
 
 FOLDER = 'parts'
-# Name and text of the file that marks this folder as written by fleet.
+# Name and text of the file that marks `FOLDER` as written by fleet.
 _MARK, _MARK_TEXT = 'ou_monitor_fleet.txt', b'Results of ou-monitor fleet, one a recording.\n'
 # How the file of each result begins.
 _BEGIN = b'{"error": ""'
@@ -99,7 +99,7 @@ class Fleet:
     judgement: Judgement
     notes: tuple[str, ...]  # How vehicles were named, skipped files, and the like
     recordings: int  # Recordings found
-    limit: float = NAN  # Voltage below which dips are counted, V; NaN when none was given
+    limit: float = NAN  # Voltage below which dips are counted, V; NaN: dips are not counted
 
     @property
     def vehicles(self) -> list[str]:
@@ -177,7 +177,7 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
     """Return all rows of the table, and notes on vehicles, flights and damage."""
-    # The vehicle of a copy is named by its content, else by the path of the copy.
+    # A duplicate's vehicle is named by its metadata, else by its own path.
     whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
     vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)
     starts = {path: r.get('start', NAN) for path, r in results.items() if not r['error']}

@@ -1,11 +1,11 @@
 """
 The fleet table -> drifting vehicles, and outliers among recordings and vehicles.
 
-doc/fleet.md states the tests, their false-alarm rates and their limits; this is how they are
-computed.
+doc/fleet.md states the tests, their false-alarm rates and their limits.  This module computes
+them as follows.
 
 Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
-(straight between knots, fitted by Huber's estimate, with a level for each vehicle).  Values are
+(straight between knots, fitted by Huber's estimate, with an offset for each vehicle).  Values are
 moved along the curve to the median throttle, which adds an error; values without throttle are not
 moved.  Resistance and sag come from the `supply` facts, per cell where cells are known.
 
@@ -13,15 +13,15 @@ Drift: a line through the logarithms against flight number.  Weights come from t
 normal scatter between flights (Paule and Mandel).  The scale of the t test is the scatter about
 the line, so an error common to all flights does not count.
 
-Fewer than `LEAST_VEHICLES` vehicles with packs of the same number of cells: resistance and sag of
-each are compared with the mean of the others by a t test, scaled by the pooled scatter between
-flights.
+Few vehicles: if fewer than `LEAST_VEHICLES` have packs of the same number of cells, resistance and
+sag of each are compared with the mean of the others by a t test, scaled by the pooled scatter
+between flights.
 
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
-divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between recordings, a
-median absolute deviation.  The bound is a quantile of the largest score in simulated fleets
-without faults, evaluated in the same way; they use the upper 90 % bound of s, which gives too few
-false alarms rather than too many.  If many members of a group are off, its median is off too.
+divided by sqrt(s^2 + se^2).  se is the standard error of the value, s the scatter between
+recordings (a median absolute deviation).  The bound is a quantile of the largest score in
+simulated fleets without faults.  They are simulated with the upper 90 % bound of s, which gives
+too few false alarms rather than too many.  If many members of a group are off, so is its median.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _VAGUE = 0.5
 # Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
 _ROUNDS = 30
-# Maximum pieces of the curve, rows needed for each, and minimum distance of its knots.
+# Maximum pieces of the curve, minimum rows for each, and minimum distance (throttle) of its knots.
 _PIECES, _ROWS, _APART = 8, 12, 0.03
 
 
@@ -87,11 +87,11 @@ class Values:
     value: FloatArray
     error: FloatArray
     curve: CommonCurve  # Curve that was subtracted
-    # Values as measured, in the unit of the quantity (geometric means weighted by time), and their
-    # mean throttle, NaN where unknown; shape (n,).
+    # Values as measured, in the unit of the quantity (geometric means weighted by time), and the
+    # mean throttle at which they were measured, NaN where unknown; shape (n,).
     measured: FloatArray
     throttle: FloatArray
-    cells: IntArray  # Cells by which values are divided; 0: they are not; shape (n,)
+    cells: IntArray  # Number of cells that each value is divided by; 0: not divided; shape (n,)
     months: FloatArray  # Dates, months since 1970; NaN where unknown; shape (n,)
 
     def shown(self, value: FloatArray | float) -> FloatArray:
@@ -173,14 +173,14 @@ def _values(name: str, rows: Sequence[Row], curve: CommonCurve, value: FloatArra
 
 
 def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
-    """Return the length of each span between knots that lies below u, shape (n, k - 1)."""
+    """Return how much of each span between knots lies below u, shape (n, k - 1)."""
     columns = [np.clip(u - low, 0.0, high - low) for low, high in zip(knots, knots[1:])]
     return np.column_stack(columns) if columns else np.zeros((u.size, 0))
 
 
 def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: IntArray
            ) -> CommonCurve:
-    """Return the common curve of levels (y: logarithms, u: throttle); flat if u is constant."""
+    """Return the common curve of load levels (y: logarithms, u: throttle); flat if u is steady."""
     known = np.isfinite(u)
     if not known.any():
         return CommonCurve(NAN)
@@ -197,7 +197,7 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
     slopes = np.zeros(parts)
     inner, rest = np.zeros((y.size, parts + 1)), y
     for _ in range(_ROUNDS):
-        # Centring removes the level of each vehicle; one without known throttle has count 0.
+        # Centring removes each vehicle's offset; a vehicle without known throttle has count 0.
         count = np.maximum(np.bincount(of, weight, len(names)), 1e-300)
         inner = np.column_stack([
             column - (np.bincount(of, weight * column, len(names)) / count)[of]
@@ -222,7 +222,7 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
 def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntArray,
                vehicle: IntArray) -> FloatArray:
     """Return the covariance of slopes by leaving out one recording (`of`) at a time."""
-    # Whole recordings, because residuals within one are correlated.
+    # Residuals within a recording are correlated, so whole recordings are left out.
     # Derivative of Huber's function: 0 beyond its bend.
     pulls = (weight >= 1.0).astype(np.float64)
     bread = np.linalg.pinv((inner * pulls[:, None]).T @ inner, rcond=1e-9)
@@ -254,9 +254,9 @@ def _knots(u: FloatArray) -> list[float]:
     return knots
 
 
-# Minimum flights of a test for drift: two leave no scatter about their line.
+# Minimum number of flights to test for drift: the line through two flights leaves no scatter.
 LEAST_FLIGHTS = 3
-# A mean month, s; flights within less show no change per month.
+# A mean month, s; no change per month is computed if all flights are within one month.
 _MONTH = 365.25 / 12.0 * 86400.0
 
 
@@ -322,7 +322,7 @@ def _trends_of(values: Values) -> list[Trend]:
 def weighted_line(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[float, float, float]:
     """Return slope and start of a weighted line, and the standard error of the slope."""
     # The weights are 1 / (error^2 + s^2), with the scatter s that explains the residuals (0 if the
-    # errors do); the residuals give the scale of the error, with n - 2 degrees of freedom.
+    # errors alone do). The residuals give the scale of the error, with n - 2 degrees of freedom.
     variance = error ** 2
 
     def fit(scatter: float) -> tuple[float, float, float, float]:
@@ -398,8 +398,8 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     centre[good] = middle[0] + (0.0 if trend is None else trend[good])
     rng = np.random.default_rng(seed)
     size = max(1, min(simulations, _CELLS // se.size))
-    # If errors are as large as s, its estimate may be 0, and scores too large: simulate with the
-    # upper bound of s.
+    # If errors are as large as s, s may be estimated as 0, and scores are then too large: simulate
+    # with the upper bound of s.
     share = min(0.5 + 0.5 * _UPPER / math.sqrt(se.size), 0.95)
     most = float(_scatter(rest, se, share)[0, 0])
     largest: list[FloatArray] = []
@@ -458,7 +458,7 @@ class VehicleValues:
     names: tuple[str, ...]
     value: FloatArray  # Medians on the scale of `Values.value`; shape (v,)
     outliers: Outliers  # How far each is from the fleet
-    cells: tuple[int, ...]  # Cells by which the values of each are divided; 0: they are not
+    cells: tuple[int, ...]  # Number of cells that each value is divided by; 0: not divided
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,7 @@ COLUMNS = (
            'normal distribution'),
     Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none '
            'found'),
-    Column('line_rms', 'number', 'V', 'its rms'),
+    Column('line_rms', 'number', 'V', 'rms of that line'),
     Column('process', 'text', '', 'type of process'),
     Column('risk', 'number', '1', 'probability of a brown-out within the horizon at this level; '
            'needs --brownout-voltage or --cells'),
@@ -109,7 +109,7 @@ COLUMNS = (
     Column('size_bytes', 'count', 'byte', 'size of the recording on disk'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
-# Columns that are not copied from the result of the recording, but set separately.
+# Columns that are set separately, not copied from the result of the recording.
 _OTHERWISE = ('vehicle', 'start', 'error')
 
 

@@ -64,7 +64,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             if not by_pattern:
                 unmatched.append(path)
         elif path.parent in named:
-            # Other recordings in the folder name their vehicles, so its name is not a vehicle's.
+            # Other recordings in the folder name their vehicles, so the folder is not a vehicle.
             found[path] = Vehicle('', FOLDER)
             mixed.append(path)
         else:
@@ -162,8 +162,8 @@ def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float
             flights[path] = k + 1
     notes = []
     if by_name:
-        notes.append(f'{some(sorted(by_name), _SHOWN)}: flights are in the order of their names '
-                     'where their dates are unknown or not distinct.')
+        notes.append(f'{some(sorted(by_name), _SHOWN)}: some dates of flights are unknown or '
+                     'equal, so the order of names decides.')
     return flights, notes
 
 

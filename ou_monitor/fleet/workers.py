@@ -30,14 +30,14 @@ from urllib.parse import urlsplit
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.mcap_file import usable_memory
 
-# Several processes with several threads of linear algebra each are slower than with one each.
+# Several processes are slower with several threads of linear algebra each than with one each.
 _ONE_THREAD = dict.fromkeys(
     ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
 # Share of the memory that all workers together may use, and the minimum for one, bytes.
 _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
-# Timeout for a scheduler and for a worker, s.
+# Timeout for an answer of a scheduler or a worker, s.
 _PATIENCE = 30.0
-# Time between two checks whether a worker is left, s.
+# Time between checks whether any worker is left, s.
 _LOOK = 1.0
 LOST = ('The worker died on this recording, also in a second attempt on its own: it was killed, '
         'or the recording does not fit into memory.')
@@ -175,7 +175,7 @@ def _environment_of_workers() -> Iterator[None]:
 
 
 def _prepare(watched: Connection, memory: int) -> None:
-    """Limit the memory of this worker (bytes), and make it exit when the main process does."""
+    """Limit the memory of this worker (bytes), and make it exit when the main process ends."""
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     if hard == resource.RLIM_INFINITY or memory < hard:
         resource.setrlimit(resource.RLIMIT_DATA, (memory, hard))
@@ -210,9 +210,10 @@ class ClusterWorkers(Workers):
     """
     The workers of a Dask scheduler, which have this package and the recordings at the same paths.
 
-    Dask's configuration (``distributed.comm.tls``) names the certificates for ``tls://``; `check`
-    must return the same here and on every worker; `insecure` allows another machine without TLS.
-    InputError: the address is not safe, no scheduler or worker answers, or the versions differ.
+    Dask's configuration (``distributed.comm.tls``) names the certificates for ``tls://``.  `check`
+    must return the same text here and on every worker.  `insecure` allows another machine without
+    TLS.  Raises InputError if the address is unsafe, no scheduler or worker answers, or the
+    results of `check` differ.
     """
 
     def __init__(self, address: str, check: Callable[[], str], insecure: bool = False) -> None:
@@ -286,7 +287,7 @@ class ClusterWorkers(Workers):
             found = [future for future in futures if future.status in ('finished', 'error')]
             if found:
                 return found
-            # The scheduler is repeating the work of a worker that died.
+            # No task is done: the scheduler is repeating the work of a worker that died.
             time.sleep(0.05)
 
     def close(self) -> None:

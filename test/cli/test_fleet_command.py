@@ -247,7 +247,7 @@ def test_vehicles_flights_and_dates(rows, whole):
     dated = {row['recording']: row['start'] for row in rows if row['start']}
     assert set(dated) == {'bag_9'} and dated['bag_9'].timestamp() == 1_700_000_000
     said = ' '.join(whole[1].stdout.split())
-    assert 'vehicles by their folder' in said and 'in the order of their names' in said
+    assert 'vehicles by their folder' in said and 'the order of names decides' in said
 
 
 def test_each_column_has_unit_and_meaning(whole):

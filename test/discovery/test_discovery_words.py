@@ -151,7 +151,7 @@ def test_every_cause_has_its_words(name):
     values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
     term = kind.read(values)
     text = explain(term, {}, 0.01, 0.001, ['drift'], False)
-    assert len(text) > 120 and 'this would' in text and '(for drift)' in text
+    assert len(text) > 120 and 'To separate them' in text and '(for drift)' in text
     told = [p for p in kind.parameters() if not (term.factors() and isinstance(values[p], list))]
     assert all(f'{kind.label(p)} = ' in text for p in told)
     assert all(f'factor over {name} = ' in text for name in term.factors())
