@@ -1,11 +1,11 @@
 """
 The voltage of a Linux IIO or hwmon device: polled, or in blocks from the kernel's buffer.
 
-Limits: file permissions decide what can be read and written; errors say what to do.  A polled
-voltage (hwmon `inN_input`, or IIO `_raw` without a buffer) is as old as the driver's last
-conversion; polling faster than `update_interval` repeats readings.  Only one program can read a
-buffer, and only one channel is read.  Without a timestamp channel, the stamp of a block is the
-time at which it was read: its last sample is older by the scheduler's delay.
+Limits: the user needs file permissions; errors say how to get them.  A polled voltage (hwmon
+`inN_input`, or IIO `_raw` without a buffer) is as old as the driver's last conversion; polling
+faster than `update_interval` repeats readings.  Only one program can read a buffer, and this
+module reads only one of its channels.  Without a timestamp channel, a block is stamped when it is
+read: later than its last sample, by the scheduler's delay.
 
 The kernel's ABI (Documentation/ABI/testing/sysfs-bus-iio, iio_devbuf): a scan holds its elements
 in the order of their indices, each at a multiple of its own size, and is padded to a multiple of
@@ -54,7 +54,7 @@ def number_of(path: Path) -> float:
 def write_attribute(path: Path, value: object) -> None:
     """Set an attribute."""
     try:
-        # Without O_CREAT, so that a missing attribute is an error in a test's folder, too.
+        # Without O_CREAT, a missing attribute is an error even in a test's ordinary folder.
         handle = os.open(path, os.O_WRONLY | os.O_TRUNC)
         try:
             os.write(handle, f'{value}\n'.encode('ascii', 'replace'))
@@ -120,7 +120,7 @@ def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
 
 
 def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
-    """Return the file of an attribute: the channel's, else the one for all; or None."""
+    """Return the file of an attribute: the channel's, else the one for all channels, else None."""
     return next((folder / name for name in (f'{channel}_{what}', f'in_voltage_{what}', what)
                  if (folder / name).exists()), None)
 
@@ -167,7 +167,7 @@ class Element:
     """One element of a scan."""
 
     name: str  # 'in_voltage0', 'in_timestamp'
-    index: int  # Its place among the elements
+    index: int  # Position in the order of the elements
     order: str  # '<' or '>'
     signed: bool  # Whether two's complement
     # Valid bits, bits in memory, and bits below the valid ones.
@@ -204,7 +204,7 @@ class Scan:
         self.size = self._dtype.itemsize
 
     def integers(self, data: bytes, name: str) -> npt.NDArray[np.int64]:
-        """Return the numbers of one element in whole scans."""
+        """Return the integers of one element, one for each scan."""
         element = self._elements[name]
         stored = np.frombuffer(data, self._dtype)[name].astype(np.uint64)
         unused = np.uint64(64 - element.bits)
@@ -215,12 +215,12 @@ class Scan:
         return (top >> unused).astype(np.int64)
 
     def volts(self, data: bytes, name: str, scale: float, offset: float) -> FloatArray:
-        """Return one element of whole scans in V (scale in mV, as the kernel gives it)."""
+        """Return one element of each scan, V (scale in mV, as the kernel gives it)."""
         return (self.integers(data, name).astype(np.float64) + offset) * (1e-3 * scale)
 
 
 STAMP = 'in_timestamp'
-# An interval above this multiple of the typical interval means that a full buffer lost samples.
+# Multiple of the typical interval above which an interval means that a full buffer lost samples.
 HOLE = 1.5
 # Number of newest intervals whose median is the typical interval.
 INTERVALS = 64

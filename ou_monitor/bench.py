@@ -515,7 +515,7 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
 
     level_now = load.level
     if load.basis is Basis.CURRENT:
-        # That level is without any current; a flight needs the one without throttle.
+        # That is the voltage at zero current; a flight needs the voltage at zero throttle.
         last = recording.t > recording.t[-1] - _RECENT
         level_now = float(np.nanmedian(recording.voltage[last] + np.interp(
             recording.throttle[last], facts.sag.throttle, facts.sag.sag_v)))

@@ -1,9 +1,9 @@
 """
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-For risk and sliding estimates, `SupplyMonitor` processes the recording as in flight, so that
-command and node agree; they need no constant throttle, and have the monitor's limits.  The risk is
-for the state at the end, and NaN at throttles 0.1 or more above the highest flown.
+Risk and sliding estimates come from `SupplyMonitor`, which processes the recording as in flight,
+so that command and node agree.  They need no constant throttle, and have the monitor's limits.
+The risk is for the end of the recording; 0.1 or more above the highest throttle flown, it is NaN.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """
@@ -51,7 +51,7 @@ class Analysis:
     by_throttle: ByThrottle  # Risk over throttle
     sliding: Sliding  # Estimates and risk of the node over time
     quality: tuple[QualityItem, ...]  # Cautions about the numbers, worst first
-    brownout_default: bool  # Whether the limit is the node's default, because none was given
+    brownout_default: bool  # No limit was given: the node's default for a 5 V rail, else no limit
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise
     craft: Craft  # Cells, and a comparison with known craft
@@ -221,7 +221,7 @@ def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: 
     grid, last = np.array(THROTTLES), found.end
     risk = np.full(grid.size, NAN)
     if last is not None and last.risk_curve:
-        # RISK_CURVE has the same throttles; keep one beyond the highest flown, to interpolate.
+        # RISK_CURVE has the throttles of `grid`; keep one above the highest flown, to interpolate.
         risk = np.where(grid >= found.highest + 0.1, NAN, last.risk_curve)
     return ByThrottle(
         grid, flown_near(recording, grid), risk, NAN if last is None else last.budget,

@@ -11,9 +11,9 @@ coupling.  If there is any, the signal is regressed on voltage, throttle and its
 are divided by the noise of the signal, which grows with throttle, so that a few loud ones do not
 dominate.  Repeated readings of the ADC are dropped: the steps that they make come from the logger.
 
-Cubic splines bring all series to the even grid of the fastest one.  If that is more than 8 times
-as fast as the slowest, the grid has 4 times the slowest rate, and series more than 1.5 times as
-fast as the grid are averaged.  The usable band ends at a quarter of the slowest rate; above it,
+Cubic splines bring all series to an even grid with the highest of their rates.  If this is more
+than 8 times the lowest rate, the grid has 4 times the lowest rate, and series more than 1.5 times
+as fast as the grid are averaged.  The usable band ends at a quarter of the lowest rate; above it,
 the spline attenuates by more than 3 %.  Limits: aliases of the original sampling remain, and a
 stamp error of e seconds gives a phase error of 2 pi f e.
 
@@ -24,12 +24,12 @@ stamp error of e seconds gives a phase error of 2 pi f e.
   squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p), for
   any voltage, with K segments and p causes (throttle and its square) regressed out (Halliday et
   al., 1995).
-- Moving lines and bursts are not whitened in this way.  So the second test compares the sum over
-  bins and the largest bin with their values under random signs of blocks of neighbouring segments
+- This does not whiten moving lines and bursts.  So the second test compares the sum over bins and
+  the largest bin with their values when the signs of blocks of neighbouring segments are random
   (Freedman and Lane, 1983).
 
 Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
-in both is detected although it is not coupling (`narrow`).
+in both series is detected although it is not coupling (`narrow`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ LOWEST = 5.0
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16  # Minimum number of segments
 LONGEST_LAG = 0.05  # Maximum lag that is searched, s
-# Minimum share of the common time that is used; below it, a note is added.
+# Share of the common time; if less is used, a note says so.
 _SHARE_USED = 0.9
 _BLOCKS = 12  # Blocks of the jackknife
 # Probability with which a gain at the reported limit is detected.
@@ -126,8 +126,8 @@ def estimate_coupling(
         notes.append('Throttle is unknown: its effect on both series would count as coupling.')
     grid = on_grid(series)
     if grid.duration < _SHARE_USED * grid.shared:
-        notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s covered by both were '
-                     'used: the rest has gaps, or a series has another rate there; --from and '
+        notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s that all series '
+                     'cover were used: elsewhere a series has gaps or another rate. --from and '
                      '--to choose a part.')
     low, high = _band(band, grid)
     length = _segment_length(grid, low)
@@ -178,7 +178,7 @@ def estimate_coupling(
 
 def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
              ) -> tuple[FloatArray, FloatArray]:
-    """Return the voltage without repeated readings; note how many were left out."""
+    """Return the voltage without repeated readings; add a note on the repeats."""
     good = np.isfinite(t) & np.isfinite(voltage)
     places, at, period = new_readings(t[good], voltage[good])
     if period > 1.0:
@@ -217,7 +217,7 @@ def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
 
 
 def _segment_length(grid: Grid, low: float) -> int:
-    """Return the number of samples of a segment; the band starts at its third bin or later."""
+    """Return the samples per segment, enough for the band to start at the third bin or later."""
     seconds = min(max(grid.duration / _PIECES, _SHORTEST), _LONGEST)
     return max(32, round(max(seconds, 3.0 / low) * grid.rate))
 
@@ -405,11 +405,11 @@ _AROUND = 11
 STRIDE = 2
 # Power correlation of half-overlapping Hann segments: (1/6)^2.
 OVERLAP = 1.0 / 36.0
-# Random draws of signs; number of draws that must reach the statistic for a p-value by counting
-# (otherwise it is extrapolated).
+# Number of random draws of signs; if `_COUNTED` or fewer of them reach the statistic, the p-value
+# is extrapolated.
 _DRAWS, _COUNTED = 499, 10
-# Segments with a common sign, because overlap, lines and slow manoeuvres correlate them; minimum
-# number of blocks, so that 2^16 different draws exist.
+# Maximum number of segments that share a drawn sign (a block), because overlap, lines and slow
+# manoeuvres correlate them; minimum number of blocks, so that 2^16 different draws exist.
 _BLOCK, _SIGNED = 16, 16
 # Family-wise significance level at which a bin counts as coherent in `_is_narrow`.
 _LINE = 1e-4

@@ -32,7 +32,7 @@ HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
 # Lowest voltage of a cell at which a supply is guessed to be a pack, V: pilots are warned below it
 # (vbat_warning_cell_voltage of Betaflight).  Thus rails of 3.3, 5, 6, 9 and 10 V are not packs.
 _PACK = 3.5
-# Largest pack that is guessed, cells: 100 V, the limit of common high-voltage ESCs.
+# Maximum number of cells that is guessed: 100 V, the limit of common high-voltage ESCs.
 _MOST_GUESSED = 24
 # Cell voltage at rest that a guess prefers, V: between full (4.2) and half full (3.8).
 _HALF = 4.0
@@ -47,8 +47,8 @@ _CELL_MOST = 5.0
 _FULL = 0.5
 
 MICRO, QUAD, ROBOT = '1S micro', 'quad, 2S and more', 'robot on 12 V'
-# Class -> craft -> cells, sag and noise at half throttle, V, and resistance, Ohm, of
-# the pack; by `supply_facts` in November 2026.
+# Class -> craft -> cells, sag and noise at half throttle, V, and resistance of the pack, Ohm (NaN:
+# unknown), by `supply_facts` in November 2026.
 KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
     # Crazyflie in close flight and taking off (aerorobotics/neural-swarm).
     MICRO: {'cf_solo': (1, 0.095, 0.0034, NAN), 'cf_takeoff': (1, 0.134, 0.0038, NAN)},
@@ -59,8 +59,8 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
            '3s_erpm2': (3, 0.289, 0.214, NAN), 'ar8': (6, 1.889, 0.050, NAN),
            'hiro': (4, 0.521, 0.767, NAN), 'roma': (6, 1.178, 0.537, 0.0351),
            'erle': (3, 0.665, 0.109, NAN), 'jd': (4, 0.398, NAN, 0.0175)},
-    # DTU REGBOT (zachasme/regbot), NaN if sag or resistance is unknown; an FRC robot of 2022
-    # with a lead-acid battery (orangelight/DSLOG-Reader), which counts as 3 cells.
+    # DTU REGBOT (zachasme/regbot); an FRC robot of 2022 with a lead-acid battery, which counts as
+    # 3 cells (orangelight/DSLOG-Reader).
     ROBOT: {'regbot_10': (3, 0.043, 0.0058, NAN), 'regbot_19': (3, 0.063, 0.0113, NAN),
             'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
             'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),
@@ -246,7 +246,7 @@ def _measure(kind: str, name: str, value: float, reach: float, middle: float) ->
     high = value - reach > usual[1]
     if high or value + reach < usual[0]:
         return Measure(kind, name, value, usual, 'high' if high else 'low', *_REASONS[name, high])
-    # Also false for NaN.
+    # False if a number is NaN.
     known = reach <= value and usual[0] <= value <= usual[1]
     return Measure(kind, name, value, usual, 'usual' if known else 'unknown', '', '')
 

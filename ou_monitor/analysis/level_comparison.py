@@ -6,7 +6,7 @@ mean.  The standard errors, proportional to 1/sqrt(alpha T), are computed with t
 with its own alpha, a level whose alpha is high by chance would weigh too much.  Levels that one OU
 in white noise does not describe (more than one relaxation, or lines with impulses) are withheld,
 because their standard errors ignore the misfit.  Limits: only levels with a usable fit count; weak
-lines stay in the fit; not rejecting proves nothing, so the detectable ratio is reported too.
+lines stay in the fit; a test that does not reject proves nothing without the detectable ratio.
 
 The significance level is `LEVEL`, which matches the printed 95 % intervals.  Each level is fitted
 by itself here; `discover` fits one model to a whole recording, and tests whether its innovations
@@ -27,7 +27,7 @@ from scipy.special import chndtrinc
 
 # Significance level of a difference, and power of the test at `detectable_ratio`.
 LEVEL, POWER = 0.05, 0.9
-# Minimum change that matters, as a factor: in most flights tau is not known more precisely.
+# Minimum change that matters, as a factor: most flights do not determine tau more precisely.
 NARROW = 1.5
 
 
@@ -45,10 +45,10 @@ class AlphaTest:
     # chi^2 with levels - 1 degrees of freedom.
     statistic: float = NAN
     p_value: float = NAN
-    # Ratio of alpha, highest over lowest level, that the test detects with 90 % probability if
-    # ln(alpha) is linear in throttle.
+    # Ratio of alpha, at the highest over at the lowest throttle, that the test detects with 90 %
+    # probability if ln(alpha) is linear in throttle.
     detectable_ratio: float = NAN
-    # Fitted ratio, highest over lowest throttle (NaN if not determined), and its 95 % interval.
+    # The fitted ratio (NaN if not determined), and its 95 % interval.
     ratio: float = NAN
     ratio_low: float = NAN
     ratio_high: float = NAN
@@ -146,9 +146,9 @@ def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SigmaChange:
-    """Ratio of the sigmas of two levels."""
+    """Sigma of one level over sigma of another."""
 
-    # As fitted (NaN if not determined), and its 95 % interval.
+    # The fitted ratio (NaN if not determined), and its 95 % interval.
     ratio: float
     ratio_low: float
     ratio_high: float
@@ -162,9 +162,9 @@ class SigmaChange:
 
 
 def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ()) -> SigmaChange:
-    """Compare sigma of two usable levels; its error includes the scatter of all levels."""
-    # If ln sigma scatters about a line over throttle by more than the errors of the levels, the
-    # excess has another cause, such as a load that throttle does not show.
+    """Return sigma of `high` over that of `low`; its error includes the scatter of all levels."""
+    # If ln sigma scatters about a straight line over throttle by more than the errors of the
+    # levels, the excess has another cause, such as a load that throttle does not show.
     every = [low, *others, high]
     scatter = 0.0
     if others:

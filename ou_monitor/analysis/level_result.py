@@ -5,7 +5,7 @@ Level and load are subtracted from the whole recording first
 (`ou_monitor.analysis.noise.remainder`); the residual in the segments of the level, without
 spectral lines, is fitted by the model that all commands share (`ou_monitor.model.ou_fit`).
 
-Limits: a relaxation slower than half of a segment, or than 2.5 s, counts as drift of the level.
+Limits: a relaxation slower than half a segment, or than 2.5 s, counts as drift of the level.
 
 The process types are from Table 1 of the paper, which assigns them by eye.  Here tests decide
 (`ou_monitor.analysis.level_tests`), adjusted so that only one in a hundred recordings of
@@ -14,7 +14,7 @@ stationary OU levels has any rejection.  The first rule that applies names the l
 1. mean or intensity changes: 'quasi-stationary' (the verdict also names the type without them);
 2. isolated extreme innovations, or heavy tails: 'with impulses';
 3. not a normal distribution: 'not Gaussian';
-4. too few samples to detect heavy tails: 'undetermined';
+4. samples too few, or ADC steps too coarse, to detect heavy tails: 'undetermined';
 5. neighbours uncorrelated: 'Gaussian';
 6. lines carry most of the variance, or no relaxation is visible: 'stationary stochastic';
 7. no usable fit: 'undetermined';
@@ -52,7 +52,8 @@ from scipy import stats
 from scipy.signal import welch
 
 
-# Excess kurtosis that the tests must be able to detect, with this power, to name a level Gaussian.
+# Excess kurtosis that the tests must be able to detect, with power `_POWER`, before a level is
+# named Gaussian or a diffusion.
 VISIBLE_KURTOSIS = 1.0
 _POWER = 0.9
 # Maximum share of spectral lines in the variance of a level named a diffusion.

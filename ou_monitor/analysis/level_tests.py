@@ -22,8 +22,8 @@ second_relaxation
 A rejection counts only if the effect is large enough to matter: with 10^5 samples, even a change
 of sigma by 1 % is significant.  Limits: the OU is fitted to the same samples and absorbs part of a
 slow drift or a second time constant, which lowers the power; coarse ADC steps hide the shape;
-changes within a sixteenth of the level average out; with correlation other than a relaxation (a
-tone), the tests of the shape reject a little too often.
+changes within a sixteenth of the level average out; if a tone correlates the samples, the tests of
+the shape reject a little too often.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ FEWEST = 50
 _BLOCKS = 16
 # Minimum length of a block in the test of the mean, relaxation times.
 _MEAN_BLOCK = 5.0
-# The test of intensity leaves out innovations beyond this, standard deviations; otherwise a few
-# impulses would determine the variance of a block.  With heavy tails (Student's t with 5 degrees),
-# it removes 1 in 10^4.
+# Innovations farther from the median, in standard deviations, are left out of the test of
+# intensity, or a few impulses would determine the variance of a block.  With heavy tails
+# (Student's t with 5 degrees of freedom), 1 in 10^4 is left out.
 _FAR = 10.0
 _LAGS_RAW, _LAGS_FITTED = 5, 10  # Lags tested, of samples and of innovations
 # Minimum effects that matter, in the unit of each test.
@@ -92,7 +92,7 @@ class Shape:
     kurtosis: float
     impulses: int  # Innovations above the 99 % quantile of the largest of n normal ones
     impulse_rate: tuple[float, float, float]  # Their rate, 1/s, and its 95 % interval (Poisson)
-    # p-value of an AC-coupled instrument, Holm-adjusted over all levels; NaN if not tested.
+    # p-value of the test for AC coupling, Holm-adjusted over all levels; NaN if not tested.
     coupling_p: float = NAN
 
     def __getitem__(self, name: str) -> TestResult:

@@ -1,9 +1,9 @@
 """
 Load levels: segments of a recording at constant throttle.
 
-A segment starts when throttle comes within the half width of a level, and ends when it is farther
-away than twice that, so that jitter of the stick does not split it.  The half width is
-`HALF_WIDTH`, or more if the stick jitters more.  A ramp that passes a level is not a segment.
+A segment starts when throttle comes within the half width of a level, and ends when it is more
+than two half widths away, so that jitter of the stick does not split the segment.  The half width
+is `HALF_WIDTH`, or more if the stick jitters more.  A ramp that passes a level is not a segment.
 Limits: throttle is a command, not a current, so two segments at one throttle can have different
 loads, and a segment need not be stationary; levels closer than the jitter are merged.
 """
@@ -30,15 +30,14 @@ _SPREADS, _WIDEST = 2.5, 0.03
 # sticks often do not move at idle and jitter only in flight.
 _LOOK, _QUIETER = 1.0, 0.75
 # Time left out after a change of throttle by more than two half widths, s: six relaxation times of
-# the rail of the paper (15.9 ms), after which 0.2 % of a step is left.
+# the paper's rail (15.9 ms), after which 0.2 % of a step is left.
 SETTLE = 0.1
 # A level needs this share of the recording, or one segment of this length, s: a few seconds at
 # full throttle matter.
 MIN_SHARE, LONG_STAY = 0.02, 2.0
 # Minimum time at a throttle to consider it, s.
 MIN_TIME = 0.25
-# Minimum length of the longest segment of a level, s: thirty relaxation times of the rail of the
-# paper.
+# Minimum length of the longest segment of a level, s: thirty relaxation times of the paper's rail.
 MIN_STAY = 0.5
 MAX_LEVELS = 20  # Maximum number of levels
 # A passage through a level: maximum duration, s; minimum difference between the means of the first

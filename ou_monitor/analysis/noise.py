@@ -31,7 +31,7 @@ _PART, _IN_PART = 60.0, 200
 _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
-# Maximum share of readings that are left out as outliers ("wild"); if there are more, none are.
+# Maximum share of readings left out as outliers ("wild"); if more are far off, none is left out.
 _WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
@@ -92,7 +92,7 @@ def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The voltage of a recording without level and load, by regressions of parts."""
+    """The voltage of a recording without level and load, regressed part by part."""
 
     voltage: FloatArray  # V, corrected for degrees of freedom; NaN near gaps
     size: FloatArray  # size of the noise relative to its rms in the part
@@ -190,7 +190,7 @@ def _needed_readings(recording: Recording) -> float:
 
 def _over_throttle(u: FloatArray, square: FloatArray, enough: float,
                    beyond: float | None = None) -> tuple[float, ...]:
-    """Return rms, V, at THROTTLES; beyond those flown, `beyond` or (None) the nearest value."""
+    """Return rms, V, at THROTTLES; outside the flown ones, `beyond`, or the nearest if None."""
     at, rms = [], []
     for throttle in THROTTLES:
         near = np.abs(u - throttle) <= BAND

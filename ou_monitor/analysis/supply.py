@@ -188,7 +188,7 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
 def facts_and_end(recording: Recording, limit: float | None = None, left: Remainder | None = None,
                   monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
-    """Return the facts, the node's load and, with a limit, V, the node's report at the end."""
+    """Return the facts, the node's load model and, with a limit, V, its report at the end."""
     # left: `remainder` of the recording, outliers included; monitor: from `node_for`, fed with the
     # recording.  Both cover only times with power (`supplied`), and are computed if omitted.
     if limit is not None and not math.isfinite(limit):
@@ -288,7 +288,7 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, rise: Float
 
 
 def alarms(recording: Recording, cells: int, noise: Noise) -> tuple[Dips, ...]:
-    """Return the dips below each of ALARMS; none if the cells are unknown (0)."""
+    """Return the dips below each of ALARMS; empty if the number of cells is unknown (0)."""
     if not (cells and recording.n):
         return ()
     there = supplied(recording, at_ends=True)
