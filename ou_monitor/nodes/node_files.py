@@ -35,7 +35,7 @@ T = TypeVar('T')
 
 # Timeout of reading or writing a file, s: most files take 10 ms, the largest allowed take 5 s.
 PATIENCE = 20.0
-# Period of calls that keep the node working while it waits, s.
+# Period at which `meanwhile` is called while a file is read or written, s.
 PAUSE = 0.02
 # Maximum number of flights in the history of a model file; maximum size of the file, bytes.
 _HISTORY, _LARGEST = 200, 2_000_000
@@ -50,7 +50,7 @@ class ModelChoice:
         self._reader = ThreadPoolExecutor(1, 'model_file')
 
     def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
-        """Read the file unless it is in use; `ValueError` says why it cannot be used."""
+        """Read a model file that is not yet in use; raise `ValueError` if it is unusable."""
         if not path or path == self._used[0]:
             self._checked = self._used if path else ('', None, b'')
             return
@@ -129,7 +129,7 @@ def _read(path: str) -> tuple[ModelFile, bytes]:
 
 
 def _save(path: str, file: ModelFile, known: bytes) -> bytes:
-    """Replace a model file that still holds `known`; return its new bytes."""
+    """Replace a model file if its bytes are still `known`; return the new bytes."""
     from ou_monitor.recordings.model_file import as_yaml
     # Keep the comments at the top of the file.
     lines = known.decode('utf-8-sig').splitlines(keepends=True)
@@ -148,7 +148,7 @@ def _save(path: str, file: ModelFile, known: bytes) -> bytes:
 
 
 def _check_kind(path: str | Path) -> None:
-    """Raise `ValueError` unless it is a regular file, because opening a device has effects."""
+    """Raise `ValueError` unless a path is a regular file: opening a device has side effects."""
     kind = os.lstat(path).st_mode
     if not stat.S_ISREG(kind):
         raise ValueError('it is a symbolic link' if stat.S_ISLNK(kind)
@@ -269,7 +269,7 @@ class LatchFile:
             _check_kind(self.path)
         except FileNotFoundError:
             return None
-        # If a link or another file has taken its place since, do not follow, wait for, or lock it.
+        # Neither follow a link, nor wait for a FIFO, that has replaced the file since the check.
         handle = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             found = self._parse(handle)
@@ -279,7 +279,7 @@ class LatchFile:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     raise ValueError('another node of this name is using it') from None
-                # The lock may be of a file that its owner has just replaced.
+                # The file just locked may be an old one that its owner has replaced.
                 if not os.path.samestat(os.lstat(self.path), mine):
                     raise ValueError('another node of this name is using it')
                 self._keep_lock(handle)

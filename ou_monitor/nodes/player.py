@@ -169,11 +169,11 @@ class Player(Node):
                 and not (topic == '/clock' and self._options.clock > 0.0)}
 
     def going(self) -> bool:
-        """Whether no signal has arrived."""
+        """Return True until a signal arrives."""
         return bool(self.context.ok())
 
     def play(self) -> dict[str, Any]:
-        """Play until the end, or a signal; return what was done."""
+        """Play until the end of the bag or a signal; return a summary."""
         self._wait_for_subscriber()
         # Avoid pauses by the garbage collector, which would disturb the spacing.
         gc.collect()

@@ -2,7 +2,7 @@
 Start, spin and end a node: the same for every executable.
 
 Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 for unusable user input, with one
-FATAL line that says what is wrong and what to do; SIGALRM if the middleware hangs (`END`).
+FATAL line that says what is wrong and what to do; SIGALRM if ending takes longer than `END`.
 Anything else is a bug and shows its traceback.  This module can be imported without ROS 2, so that
 the executables can report that ROS 2 is not installed.
 """
@@ -36,8 +36,7 @@ END = 1.0
 # Variables that give Fast DDS its profiles (the older name first), or its transports.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
-# Set while a signal may end the process at once, and while a signal may interrupt the creation of
-# a node.
+# Set while a signal may end the process at once; set while it may interrupt creating a node.
 _loading, _making = threading.Event(), threading.Event()
 
 
@@ -91,7 +90,7 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
         from rclpy.utilities import remove_ros_args
         left = remove_ros_args(sys.argv)[1:]
         if left:
-            # rclpy would ignore it, and run, for example, with another fmin than requested.
+            # rclpy would ignore the argument, and use, for example, the default fmin.
             raise InputError(f"'{left[0]}' is not an option: parameters and remappings go after "
                              '--ros-args, as in --ros-args -p NAME:=VALUE -r FROM:=TO')
         return work()
@@ -181,7 +180,7 @@ def spin(make: Callable[[], Any]) -> int:
     executor.add_node(node)
     manager = ServiceManager()
     if manager.interval:
-        # Use a timer of the node, so that the signal stops if the executor no longer runs timers.
+        # Use a timer of the node, so that WATCHDOG=1 is no longer sent if the executor hangs.
         node.every(manager.interval, lambda: manager.tell('WATCHDOG=1'))
     # Freeze the loaded objects, because a garbage collection over them blocks for 40 ms, and would
     # delay the end of the process by 0.2 s.
@@ -237,7 +236,7 @@ class ServiceManager:
         """Send a state, such as 'READY=1'; ignore failures."""
         if not self._address:
             return
-        # An abstract name begins with a zero byte, which the variable writes as @.
+        # An abstract socket name begins with a zero byte, which NOTIFY_SOCKET writes as @.
         address = '\0' + self._address[1:] if self._address[0] == '@' else self._address
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:

@@ -47,7 +47,7 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
 MOTOR_PARAMETERS: tuple[Parameter, ...] = (
     _CONFIG, *_where('throttle', 'throttle'), *_where('rpm', 'motor speeds'))
 
-# In auto mode, throttle may be a bare scalar, which needs no msg_config.
+# In auto mode, throttle and motor speeds may be bare numbers, which need no msg_config.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 _ARRAYS = ('std_msgs/msg/Float32MultiArray', 'std_msgs/msg/Float64MultiArray')
 
@@ -65,7 +65,7 @@ class Source:
     current: FieldSpec | None = None  # For a voltage: the field of the current
 
     def choose(self, types: Sequence[str]) -> Source | None:
-        """Return the candidate for one of the types on offer; None if there is none."""
+        """Return the first candidate whose message type is in `types`, or None."""
         for candidate in self.candidates:
             if candidate.spec is not None and candidate.spec.type in types:
                 return candidate
@@ -123,7 +123,6 @@ def _generic(quantity: str) -> list[Source]:
     """Return the generic msg_configs' entries for a quantity, one per type."""
     found: dict[str, Source] = {}
     if quantity != 'voltage':
-        # Bare numbers are the same in all msg_configs, so no msg_config is named.
         for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
@@ -170,7 +169,7 @@ def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
 # Folder of the ament index below a prefix, with a file for each package.
 _INDEX = 'share/ament_index/resource_index/packages'
 
-# Names of primitive types: in rosidl's Python, and in a definition.
+# Names of primitive types in rosidl's Python, and in message definitions if they differ.
 _WORDS = {'float': 'float32', 'double': 'float64', 'boolean': 'bool', 'octet': 'byte'}
 _SEQUENCE = re.compile(r'sequence<(.*?)(?:, \d+)?>')
 _ARRAY = re.compile(r'(.*)\[(\d+)\]')

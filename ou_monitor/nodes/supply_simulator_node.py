@@ -47,14 +47,14 @@ FIXED_PARAMETERS: tuple[Parameter, ...] = (
               'or a recording; empty: use the throttle topic.'),
 )
 _SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name != 'adc.sample_rate')
-# Types if the parameters do not specify them.
+# Message types that are used if the parameters specify none.
 _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
 # Up to this rate, Hz, samples are drawn one by one; above it, in pieces of this length, s, because
 # a call of the model takes 0.2 ms of CPU, and waking the thread costs as much as a message.
 _EACH, _AHEAD = 200.0, 0.02
 # Time for which the last throttle is held, s; after it, throttle is 0.
 _HOLD = 1.0
-# Throttle beyond this value is ignored (as in the estimator); otherwise, it is clipped to 0..1.
+# Throttle of a larger magnitude is ignored (as in the estimator); the rest is clipped to 0..1.
 _MOST_THROTTLE = 2.0
 # If the clock and the next sample differ by more than this, s, the clock was set, and samples
 # continue from the clock's time.  The limit is larger than pauses under load, which last up to a
