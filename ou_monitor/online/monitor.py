@@ -54,8 +54,8 @@ class SupplyMonitor:
     model : SupplyModel, optional
         Terms of the supply, as `discover` found them; by default, none.
     background : bool
-        Whether, with window ``auto``, the fits of alpha, sigma and Var_inf run in a thread, so
-        that reports never wait.
+        Whether the fits of alpha, sigma and Var_inf for window ``auto`` run in a thread, so that
+        reports never wait.
     look : float
         Interval at which forecasts of the risk are compared with their outcomes, s.
     replay : bool
@@ -237,7 +237,7 @@ class SupplyMonitor:
         self._flag.push(np.full_like(volts, NAN), volts, times, self._trust.interval)
 
     def restart(self, error: BaseException) -> None:
-        """Restart after an error, which the next reports state; the flag keeps its state."""
+        """Restart after an error, and name it in the next reports; the flag keeps its state."""
         words = ' '.join(str(error).split())[:200]
         self._fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
         self._faulty = True
@@ -443,7 +443,7 @@ class SupplyMonitor:
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
 
     def changed_risk(self, sag: float, noise: float, voltage: float) -> FloatArray:
-        """Return the risks over throttle, (51,), with sag and noise variance times factors."""
+        """Return the risks over throttle, (51,), if sag and noise variance change by factors."""
         level, ahead = self._checked(voltage, None)
         return risk_over_throttle(self._forecast, level, ahead, sag, noise)
 
@@ -462,7 +462,7 @@ class SupplyMonitor:
         return level, ahead
 
     def _estimate(self) -> Estimate:
-        """Return the newest estimate; its IRREGULAR refers to the present window only."""
+        """Return the newest estimate; its flag IRREGULAR refers to the present window only."""
         e = self._estimator.estimate()
         counters = self._counters()
         odd = counters.late + counters.non_finite

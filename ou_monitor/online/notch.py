@@ -13,19 +13,19 @@ wins.  (A law fitted to the median of the peaks would follow the most frequent p
 strongest.)
 
 **Choice** of notches in each channel: least noise in a D term at equal lag.  The noise of a
-candidate is the power of the derivative above `fmin` after its notches and a low-pass of order 2,
-whose cutoff is raised until both together lag as much as the low-pass alone.  This is computed for
-a low-pass at `cutoff`, a slower and a faster one, for each frame before the law learns from the
-frame, and averaged.  A channel uses the best candidate if less than `_ON` of the rms without
-notches remains, and if the candidate has less noise with each of the low-passes.  It changes to
-another candidate that has a tenth less power.  It switches off if `_OFF` or more remains, or if
-the candidate does not have less noise with each low-pass.
+candidate is the power of the derivative above `fmin` after its notches and a low-pass of order 2.
+The cutoff of this low-pass is raised until both together lag as much as the low-pass did alone.
+The noise is computed for three low-passes: at `cutoff`, a slower and a faster one.  It is averaged
+over frames, each scored before the law learns from it.  A channel uses the best candidate if less
+than `_ON` of the rms without notches remains, and less noise with each of the low-passes.  It
+changes to another candidate that has a tenth less power.  It switches off if `_OFF` or more
+remains, or if the noise with any low-pass is not less.
 
-Limits: only lines that follow the motors are removed, and motor speeds or throttle are needed.
-The law does not resolve the speeds of single motors.  Lines above half the sample rate are not
-followed, because their aliases fall as throttle rises.  A change of the vehicle is learned in half
-a minute.  Frames with a gap of more than five intervals are dropped; frames with less uneven
-stamps are resampled.
+Limits: only spectral lines that follow the motors are removed, and motor speeds or throttle are
+needed.  The law does not resolve the speeds of single motors.  Lines above half the sample rate
+are not followed, because their aliases fall as throttle rises.  A change of the vehicle is learned
+in half a minute.  Frames with a gap of more than five intervals are dropped; frames with less
+uneven stamps are resampled.
 
 **Filters**: state-variable filters whose coefficients may change.  With w = 2 pi f and
 k = bandwidth / f, one notch of depth m is

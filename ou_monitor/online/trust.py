@@ -110,8 +110,8 @@ class StampWatch:
 
     def __init__(self) -> None:
         self.newest = -math.inf
-        # For each recent batch: number of samples, and of those that were late or started a new
-        # time line.
+        # For each recent batch: number of samples, and number of those that were late or started a
+        # new time line.
         self._batches: deque[tuple[int, int]] = deque()
         self._looked = self._late = 0
         # Number of samples since the newest stamp; arrival of that stamp, and of the last sample.
@@ -210,7 +210,7 @@ class InputClock:
 # cf_solo_large), or 3 readings at 1 Hz (ac_jd_2004).
 _STUCK, _STUCK_READINGS = 5.0, 10
 # While throttle is constant, the limit is at least this factor times the longest constant run that
-# ended by one ADC step: a coarse ADC repeats its reading during a slow discharge.
+# ended with one ADC step: a coarse ADC repeats its reading during a slow discharge.
 _QUIET = 4.0
 # Range within which throttle counts as constant (cf_solo_large: 0.019 within 1.06 s of hover).
 _STILL = 0.05
@@ -355,7 +355,7 @@ class InputTrust:
         return self._stamps.judge(limit, interval)
 
     def doubt(self, stamps: StampOrder, limit: float) -> tuple[Doubt, str]:
-        """Return why the input is not trusted with a voltage limit, V, and the sentence."""
+        """Return why the input is not trusted, and a sentence (limit: brownout.voltage, V)."""
         if self.outside:
             return Doubt.OTHER, self.outside
         if stamps is not StampOrder.GOOD:

@@ -38,7 +38,7 @@ LOAD_LAGS = (0.010, 0.040)
 # Time after a change of throttle within which all lags settle, s.
 LOOK_BACK = 16.0 * LOAD_LAGS[1]
 
-# Maximum exponent; even exp(2 * _SPAN) is far below the largest double.
+# Maximum exponent in `lagged`; even exp(2 * _SPAN) is far below the largest double.
 _SPAN = 300.0
 # Difference from the throttle below which a lagged throttle has settled.
 _SETTLED = 1e-7
@@ -57,8 +57,8 @@ MIN_SAMPLES = 20
 # Minimum length of a run of evenly spaced readings (and longest lag of increments); share of
 # readings in such runs below which the window counts as uneven.
 _LAGS, _EVEN = 24, 0.5
-# Jitter of the stamps, in relaxation times, above which exact stamps are used: the error of an
-# even grid grows with the square of the jitter.
+# Jitter of the stamps, in relaxation times, above which samples are not treated as evenly spaced:
+# the resulting error would grow with the square of the jitter.
 _JITTER = 0.1
 # Tolerance for rounded stamps at the edge of the window, as a share of the window.
 _ROUNDING = 1e-6
@@ -117,7 +117,7 @@ class SlidingEstimator:
         self._line = TimeLine() if line is None else line
         self._fastest = _positive('fastest', fastest, 'Hz')
         self._thinner = BlockAverager(self._fastest)
-        # Stamps, voltage and throttle; those before `_begin`, s, are for the lags of throttle.
+        # Stamps, voltage and throttle; only the lags of throttle use readings before `_begin`, s.
         self._kept = ReadingBuffer(3)
         self._begin = -math.inf
         self._tail = np.empty(0)
@@ -320,9 +320,9 @@ class SlidingEstimator:
         smoothness = NAN
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
-        # Also report a trend if the voltage drifts faster than a random walk with these
-        # increments would: if the voltage does not return, the fit may take any drift for chance.
-        # Increments over the longest lag reveal movements in one direction.  Skip this if
+        # The fit may take any drift for chance if it finds no return to the mean.  So also report
+        # a trend if the voltage drifts faster than a random walk with these increments would.
+        # Increments over the longest lag reveal movements in one direction.  Skip this check if
         # throttle moves, because the sag is still in these increments.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
@@ -373,7 +373,7 @@ class ReadingBuffer:
         self._size = size
 
     def append(self, columns: FloatArray, reach: float, most: int = 1 << 62) -> None:
-        """Add readings; keep at least the last `reach` seconds of them, or the last `most`."""
+        """Add readings; keep at least those of the last `reach` s, or the last `most` if fewer."""
         count = columns.shape[1]
         if self._size + count > self._store.shape[1]:
             # Keep one reading more, which shows that there are data before the window.
@@ -527,7 +527,7 @@ class RelaxationFits:
             (line, found, end), self._found = self._found, None
             if line == self._line:
                 self._put(found, end)
-        # The comparison is false for NaN.
+        # Before the first fit, `_due` is NaN, so a fit is due.
         if not self.readings.size or self.readings[0, -1] < self._due:
             return
         if not self._background:

@@ -1,8 +1,8 @@
 """
 Fit OU parameters, noise and mean to the samples of a window.
 
-The sag with its curvature and lag, if throttle moves, and a drift, if it is significant, are
-regressed out within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
+The restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320) removes the sag with
+its curvature and lag (if throttle moves), and a drift (if it is significant).
 
 Evenly spaced samples, or block means: `SpectralLikelihood`, the Whittle likelihood
 (model/whittle.py), which `window: auto` and `supply_facts` use too.
@@ -107,8 +107,8 @@ class WindowFit:
 _FAR = 300.0
 # Size up to which a tridiagonal system is solved as a dense one, which needs fewer NumPy calls.
 _DENSE = 24
-# Minimum gain of a step, nats, with which the result is within 1e-4 standard errors of the
-# optimum, for any start.
+# Gain of a step, nats, below which a search ends: the result is then within 1e-4 standard errors
+# of the optimum, from any start.
 _SETTLED = 1e-9
 # Maximum number of evaluations of a fit after the first; 4 to 8 are usual, and more are needed if
 # alpha and noise cannot be distinguished.

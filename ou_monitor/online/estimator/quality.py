@@ -18,10 +18,10 @@ from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # Minimum number of samples for any finding.
 _ENOUGH = 64
-# Minimum number of different steps, multiples of a common step, that prove the grid of an ADC;
+# Minimum number of different increments, all multiples of one step, that prove the grid of an ADC;
 # fewer may be chance.
 _FEWEST_STEPS = 3
-# Share of adjacent samples that differ below which the ADC counts as coarse.
+# The ADC counts as coarse if less than this share of adjacent samples differ.
 _TIED = 0.9
 # Minimum share of samples at an extreme value that counts as clipping, and minimum ratio of their
 # number to the number of samples at the adjacent code.

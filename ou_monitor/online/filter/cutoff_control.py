@@ -1,7 +1,7 @@
 """
 From the wanted cutoff of a law to the cutoff in force.
 
-limits -> dead band -> smoothing of ln(fc), faster if sigma is certain -> slew limit -> limit of
+limits -> dead band -> smoothing of ln(fc), faster if the error of sigma is small -> slew limit ->
 0.45 of the sample rate.  The fallback replaces an unknown wanted cutoff.  The cutoff in force is
 always within fmin..fmax, even if 0.45 of the sample rate is below fmin.
 """

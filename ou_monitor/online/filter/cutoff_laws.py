@@ -19,8 +19,8 @@ samples of variance 1, the stationary covariance is
 
     C = F C F^T + a a^T + b b^T + F b a^T + a b^T F^T.
 
-For their slopes (x_k - x_(k-1)) / dt, of which adjacent ones have a correlation of
--1/2, C solves, with g = a + b,
+Adjacent slopes (x_k - x_(k-1)) / dt of such samples have a correlation of -1/2.  With the
+slopes as input, and g = a + b, C solves
 
     C dt^2 = F C F^T dt^2 + 2 g g^T - F g g^T - g g^T F^T.
 
@@ -40,8 +40,8 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 
-# Range of angles (2 pi cutoff interval) in the table, and step of their logarithms, with which
-# interpolation, and the power law below the range, are accurate to 1e-4.
+# Range of angles (2 pi cutoff interval) in the table, and step of their logarithms.  With this
+# step, interpolation, and the power law below the range, are accurate to 1e-4.
 _LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
 # Minimum rise of ln noise from angle to angle; with less, all noise passes, and the table ends.
 _STILL = 1e-6
@@ -138,7 +138,7 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
 
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """Return the cutoff, Hz, at which white noise `times` as large has the same rms as at fmax."""
+    """Return the cutoff, Hz, that keeps the output rms of fmax if white noise grows by `times`."""
     # interval in s; 0: a continuous signal.  The condition keeps within the range of `_table`.
     if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
         return held_cutoff(mode, order, fmax, times, interval)
@@ -170,7 +170,7 @@ _LOGS = -14.0, 21.0
 
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
                      alpha: float) -> float:
-    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf: always less."""
+    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf if always below."""
     if intensity <= 1e-12 * rms:
         return math.inf
     wanted = (rms / intensity) ** 2

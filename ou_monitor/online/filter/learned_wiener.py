@@ -10,14 +10,14 @@ signal and C_n of the noise, and c_s, the last column of C_s, the weights
 
 give the linear combination w^T z with the least mean square error, as an estimate of the last
 element of z_s (the signal, or its slope).  This is the multichannel Wiener filter (Doclo & Moonen
-2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T with the time constant
-`_MEMORY`.  Each hop of 10 ms has the weight 1 / p^2, with p the power of the noise, because the
+2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T over hops of 10 ms, with the
+time constant `_MEMORY`.  A hop has the weight 1 / p^2, with p the power of the noise, because the
 variance of z z^T grows with p^2.  In each direction, C_s keeps only the part of C_z - C_n that
 exceeds the sampling error.
 
 - Wrong noise: if the stated noise is so large that the power of the signal would be negative, the
-  noise is reduced.  If it is too small, this can be detected only for a derivative, where some
-  direction contains almost no signal; then the noise is increased to the power in that direction.
+  noise is reduced.  Noise stated too small is detected only for a derivative, where some direction
+  contains almost no signal: the noise is then increased to the power in that direction.
 - Manoeuvre after calm: if a hop does not fit C_s + C_n (largest normalised square above the 99.9 %
   quantile of chi squared), C_s is scaled up in proportion, which opens the filter at once.
 - If the lag of the combination exceeds its limit, just enough of the input is added to meet the
@@ -26,8 +26,8 @@ exceeds the sampling error.
 A step of the low-passes (`filter_state`) is z' = F z + a start + b end, exact for an input that is
 linear between samples; for a derivative the input is the difference quotient.
 
-C_n for noise with autocorrelation phi^k: with the noise p' = phi p + e as a further state, the
-covariance solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
+C_n for noise with autocorrelation phi^k: with the noise n' = phi n + e as a further state, the
+covariance P solves P = A P A^T + q g g^T.  Its series is summed by doubling, A -> A A.
 
 Limits: in mode `lowpass`, noise in excess of the stated noise passes as signal.  The gain at
 frequency 0 is below 1.  Below 2 Hz and above 128 Hz, the filter is no better than its slowest and
@@ -120,8 +120,8 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     return np.asarray(p[np.ix_(outputs, outputs)])
 
 
-# Time between updates of the weights, which is also the time constant of the transition between
-# weights, and memory, s; chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
+# Time between updates of the weights, s (also the time constant of the transition to new weights);
+# memory, s.  Both were chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
 # Weight of the prior (no signal), s.
 _BEFORE = 1.0
@@ -149,7 +149,7 @@ class LearnedWiener:
         self.y = 0.0 if self._slope else x
         self.lag, self.mixed = NAN, 0.0
         self._x = x
-        # States of the low-passes, start and end of the step.
+        # States of the low-passes, then the input at the start and the end of the step.
         self._state = np.zeros(2 * COUNT)
         self._state[:-2:2] = self.y
         self._rows = np.empty((_ROWS, COUNT))

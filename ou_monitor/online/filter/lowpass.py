@@ -92,7 +92,7 @@ class AdaptiveLowPass:
         self._kalman: LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
-        # Copy with the parameters before a change, kept until the next sample.
+        # Copy of `_kalman` with the parameters before a change, kept until the next sample.
         self._before: LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()

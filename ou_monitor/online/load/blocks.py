@@ -1,9 +1,9 @@
 """
 Group samples into blocks; learn the delay of throttle, changes of the response, and noise.
 
-All samples of a block have the same throttle; there are at most about 50 blocks a second.  Limits:
-an incomplete block is not returned, so a fast source is followed 20 ms late; of several throttle
-changes within 20 ms, only the first three are resolved.
+All samples of a block have the same throttle; at steady throttle, there are at most 67 blocks a
+second.  Limits: an incomplete block is not returned, so a fast source is followed 20 ms late; of
+several throttle changes within 20 ms, only the first three are resolved.
 
 Delay: the voltage, without changes slower than a second, is correlated with throttle at assumed
 delays of 0 to 200 ms.  The largest correlation determines the delay, unless the source is slower
@@ -202,7 +202,7 @@ class LoadDelay:
 
     @property
     def unrelated(self) -> bool:
-        """Whether the mean correlation in 2 s segments is not significantly negative (t-test)."""
+        """Return True if a t-test over 2 s segments shows no fall of the voltage with load."""
         if self._pieces < _FEWEST:
             return False
         now = DELAYS.index(self.delay)
@@ -225,8 +225,8 @@ class LoadDelay:
         return True
 
 
-# Correlation of voltage at rest and load above which, on average over two successive segments of
-# `_PIECE`, the response has changed; minimum number of blocks in a segment.  With 0.8, no change
+# Correlation of voltage at rest and load, averaged over two successive segments of `_PIECE`, above
+# which the response has changed; minimum number of blocks in a segment.  With 0.8, no change
 # was detected in 22 recordings (gecko, nazgul, roma, hiro, cf_pair, erle, jd, euc_1, frc_ol_1 and
 # others), and simulated sags of 20 to 200 times the noise were detected within 6 s.
 _CHANGED, _BLOCKS = 0.8, 20

@@ -52,8 +52,8 @@ _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # 0.005 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and
 # regbot_28, 62 and 81.
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
-# Exponents of throttle tried for that regressor: the median of the prior in `load_fit`, and about
-# two of its deviations either way.
+# Exponents of throttle tried for that regressor: the median of the prior in `load_fit`, plus and
+# minus up to about two of its standard deviations.
 _POWERS = np.array([1.4, 1.6, 1.8, 2.0, 2.2])
 # Time for which the last throttle or current is held if the present one is unknown, s.
 UNKNOWN_HELD = 1.0
@@ -79,7 +79,7 @@ class CurrentFilter:
         self._lags = np.zeros((2, 0))
 
     def time(self, block: LoadBlock) -> None:
-        """Update the delay of the current from a block, before its load is delayed."""
+        """Update the delay of the current from a block that is not yet paired with its load."""
         self._peak = max(self._peak, abs(block.current))
         if self._peak >= _LEAST and math.isfinite(block.current) and self.delay.take(
                 block.t, block.voltage, block.current / self._peak):
@@ -171,10 +171,10 @@ class CurrentFilter:
     @property
     def _bypassed(self) -> float:
         """Return the relative error of the resistance due to loads that bypass the sensor."""
-        # It is the relative change of the resistance with throttle as a further regressor, times
-        # the share of the residual voltage that throttle explains.  Both are computed after a
-        # band-pass, because throttle also explains fast errors of the sensor, and the level
-        # changes slowly.
+        # The error is the relative change of the resistance with throttle as a further regressor,
+        # times the share of the residual voltage that throttle explains.  Both factors are
+        # computed after a band-pass, because throttle also explains fast errors of the sensor, and
+        # the level changes slowly.
         # x is the power of throttle that the current follows best, so that a wrong exponent is not
         # mistaken for another load.
         B, n = self._beside, _POWERS.size

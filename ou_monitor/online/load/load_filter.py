@@ -400,7 +400,7 @@ class LoadFilter:
             self._contrasts.take(block.t, block.voltage, h[2:], total,
                                  float(m[0]) / self._cells)
             self._highest = max(self._highest, float(m[0]))
-            # Use only the share that is due to noise, not to the uncertainty of the state.
+            # Use only the share of the error that is due to noise, not to the state's uncertainty.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
@@ -553,8 +553,8 @@ class LoadFilter:
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None
-        # The coefficients follow the last half minute, so average their size, whose relative error
-        # is SIZE_ERROR, with the size over the whole flight, weighted by the errors.
+        # The coefficients follow the last half minute.  So average their size (relative error
+        # SIZE_ERROR) with the size over the last five minutes, weighted by the errors.
         found, size, size_se = self._contrasts.against(self._m[2:]), 1.0, SIZE_ERROR
         if found.ratio > 0.0:
             size += (found.ratio - 1.0) / (1.0 + (found.se / SIZE_ERROR) ** 2)

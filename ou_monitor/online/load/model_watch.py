@@ -30,7 +30,7 @@ SIZE_ERROR = 0.1
 _NOISE_FORM = 0.15
 # Number of throttle bins of the noise, and number of bins, 0.1 of throttle, that are combined.
 BINS, NEAR = 50, 5
-# Minimum number of samples in them.
+# Minimum number of samples in the combined bins.
 _LEAST_NEAR = 10.0
 # Further relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
 # (halves of gecko, nazgul and hiro, three flights of roma), with packs at different charges.
@@ -40,10 +40,10 @@ _DISCHARGE_FORM = 0.64
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
-# Ratio of the sag to the model's below which it is another pack or load (warm packs have at least
-# 0.75).
+# Ratio of the sag to the model's below which the pack or the load must be another one (warm packs
+# have at least 0.75).
 _OTHER = 0.7
-# Ratio of two levels, up or down, beyond which it is another pack.
+# Ratio of two levels, up or down, beyond which the pack must be another one.
 OTHER_LEVEL = 1.3
 # Limits of a lithium cell's level at rest, V: minimum at take-off, minimum, and maximum (LiHV).
 _TAKE_OFF, _EMPTY, _FULL = 3.4, 3.2, 4.4
@@ -69,7 +69,7 @@ class ModelComparison:
     resistance_ratio: float = NAN
     resistance_ratio_se: float = NAN
     # Ratio of the noise of a sample at steady throttle, at the throttle of the model's noise; NaN
-    # unless both flights have been there.
+    # unless both flights used that throttle.
     noise_ratio: float = NAN
     noise_ratio_se: float = NAN
     # Ratio of the discharge per load, known to a factor of two.

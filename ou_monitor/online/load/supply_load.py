@@ -94,7 +94,7 @@ class SupplyLoad:
     level: float = NAN
     # Last voltage without the response to load (sag-compensated), V; the level is its mean.
     rest: float = NAN
-    # Resistance 1 s after a step of current, Ohm; NaN without a current that moves the voltage.
+    # Resistance after `hold`, Ohm; NaN without a current that moves the voltage.
     resistance: float = NAN
     resistance_se: float = NAN  # Its standard error, Ohm.
     resistance_at_once: float = NAN  # Resistance after `AT_ONCE`, Ohm.

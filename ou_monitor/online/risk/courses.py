@@ -88,7 +88,7 @@ class Courses:
     rest: FloatArray  # Throttle after the peak, 0..1.
 
     def after(self, first: Courses) -> Courses:
-        """Return the courses of another set, followed by these."""
+        """Return the courses of `first`, followed by these."""
         return Courses(*(np.concatenate(pair) for pair in (
             (first.peak, self.peak), (first.dwell, self.dwell), (first.rest, self.rest))))
 

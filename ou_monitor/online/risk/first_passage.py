@@ -2,8 +2,8 @@
 First-passage risk: the probability that the supply goes below a voltage within a horizon.
 
 The risk is averaged over the errors of alpha, sigma, the level and the present voltage.  It refers
-to the continuous path, which affects the hardware, not to samples.  Limits: throttle, alpha and
-sigma are assumed constant.
+not to samples, but to the continuous path, which affects the hardware.  Limits: throttle, alpha
+and sigma are assumed constant.
 """
 
 from __future__ import annotations

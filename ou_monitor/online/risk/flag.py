@@ -72,8 +72,8 @@ class FloorWatch:
         """
         Judge samples (t in s, voltage in V, arrival in s on a monotonic clock).
 
-        With `arrival`, they are judged in the order given, and a stamp may be NaN.  Without it,
-        samples of a batch that are all newer than earlier samples are sorted by their stamps.
+        With `arrival`, samples are judged in the order given, and a stamp may be NaN.  Without it,
+        a batch is sorted by its stamps if all are newer than the earlier ones.
         """
         if self.settings.floor <= 0.0:
             if self._t.size:
@@ -240,7 +240,7 @@ class BrownoutFlag:
         return self._state
 
     def configure(self, settings: MonitorSettings) -> None:
-        """Change settings; keep level, hold and samples.  Switching the latch off ends it."""
+        """Change settings; keep level, hold and samples.  Switching off the latch releases it."""
         self._settings = self._floor.settings = settings
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,

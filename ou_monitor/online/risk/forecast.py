@@ -457,7 +457,7 @@ class Forecast:
         return self._kept_flown[horizon]
 
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float]:
-        """Return the law, share and misses (two values) of its contradictions, passage's share."""
+        """Return the law, its `held` share and misses (two values), and first passage's share."""
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
