@@ -224,7 +224,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
                 WHERE, f'Vpp/Vrms, {state.label}, jumps, {ms} ms screen', '',
                 Printed(f'{value:.1f}'), best.mean,
                 f'OU with compound Poisson jumps that relax at alpha, best of '
-                f'{len(RATES) * len(SHARES)} kinds, Monte Carlo',
+                f'{len(RATES) * len(SHARES)} rates and shares, Monte Carlo',
                 f'Largest mean: {best.mean:.1f} ({best.band[0]:.1f} to {best.band[1]:.1f}), '
                 f'with {best.rate:g} jumps a second of {best.size(state.vrms.value):.0f} mV rms, '
                 f'{100 * best.share:.0f} % of the variance, excess kurtosis '

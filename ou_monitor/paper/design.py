@@ -12,7 +12,7 @@ to 3 times too high.
 Once C is large enough that the network is slower than the noise, both risks fall as C rises. Below
 that C, the second rose by a factor of up to 1.44 in 39 of 6000 random networks.
 
-`network_of` chooses components that reproduce a flight. The risks of its bus are then computed by
+`network_of` chooses components that reproduce a flight. The risks of the bus are then computed by
 the model that also gives the throttle budget of `analyze`, at the end of the flight. For other
 components, the sag is scaled with the resistance, and the noise with the noise of the network. If
 a resistance or battery voltage is given, the motor current stays as computed with the recorded
@@ -21,10 +21,10 @@ capacitor; without a measured current also the resistance) is taken to be the re
 whether it is given or the default. The risks include the errors of sag and level, and the scatter
 that throttle did not explain. Limits: sag and noise are as measured, including the white noise and
 the filter of the sensor. Noise added by changes of throttle, and an OU if one was found, count as
-slow fluctuations of the current, which capacitors on a board do not change; the rest is attributed
-to the switching of the ESCs. Without a measured current, the resistance is the given or default
-one, and the current is scaled to fit the sag: the effect of packs in parallel is still right, the
-effect of an ESR uncertain.
+slow fluctuations of the current, which capacitors on a board do not change. The rest of the noise
+is attributed to the switching of the ESCs. Without a measured current, the resistance is the given
+or default one, and the current is scaled to fit the sag. The effect of packs in parallel is then
+still right, but the effect of an ESR is uncertain.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Design:
     esr_follows: bool  # Whether ESR falls as 1/C (capacitors in parallel).
     verdict: DesignVerdict  # Verdict.
     present: DesignRow  # With the present capacitor.
-    # With the smallest capacitance such that all larger ones meet the target; None: no such one.
+    # With the smallest capacitance above which every capacitance meets the target; None: none.
     least: DesignRow | None
     doubled: DesignRow  # With twice the present capacitance.
     rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
@@ -156,7 +156,7 @@ class Design:
 
 
 def default_voltage(cells: int, rail: float) -> tuple[float, str]:
-    """Return the brown-out level of a pack, or without cells of a rail, V, and its source."""
+    """Return the brown-out level, V, of a pack or (if cells is 0) of a rail, and its source."""
     if cells:
         return CELL_BROWNOUT * cells, f'{CELL_BROWNOUT} V per LiPo cell'
     for (low, high), level in RAIL_BROWNOUT.items():

@@ -113,7 +113,7 @@ def _coupling(rows: Sequence[Row]) -> str:
     kept = math.sqrt(published.ALPHA.value / (published.ALPHA.value + CORNER))
     alpha = published.ALPHA.text
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
-            f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
+            f'AC coupling is a first-order high-pass, of 10 Hz on many oscilloscopes. Behind '
             f'it, a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {fitted.recomputed:.1f} '
             f'1/s, and the reading shows only {100 * slope.recomputed:.1f} '
             f'+- {100 * (slope.error or 0.0):.1f} % of a change of its rate. The reading never '
@@ -136,9 +136,9 @@ def _exponential(rows: Sequence[Row]) -> str:
             'all the way. An exponential plus a constant fits all five '
             f'{plain.rss / shifted.rss:.1f} times better in residual sum of squares: alpha '
             f'{shifted.parameters[1]:.1f} 1/s (95 % {low:.0f} to {high:.0f}), offset '
-            f'{shifted.parameters[2]:.1f} mV: the shape of a baseline shifted by AC coupling, or '
-            f'of a second pole. The F test of the offset gives p = {p:.2f}, so the voltages of '
-            'five points do not exclude one exponential at 95 %. If the points scatter in '
+            f'{shifted.parameters[2]:.1f} mV. AC coupling, which shifts the baseline, or a second '
+            f'pole would explain it. The F test of the offset gives p = {p:.2f}, so the voltages '
+            'of five points do not exclude one exponential at 95 %. If the points scatter in '
             'proportion to their size, as a fit of ln|U| assumes, one exponential is excluded by '
             f'the rates at: {", ".join(outside)}.')
 
@@ -225,8 +225,8 @@ def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
             f'From 5 to 40 % the crest factor goes from {low:.1f} to {high:.1f} (quotient '
             f'{quotient[0]:.2f} to {quotient[1]:.2f} within half a step): '
             'the readings do not show impulses that come with load. '
-            'Two readings at each load cannot decide between these; a recording can (ou-monitor '
-            'discover).')
+            'Two readings at each load cannot tell jumps from impulses; a recording can '
+            '(ou-monitor discover).')
 
 
 @dataclass(frozen=True, eq=False)

@@ -221,7 +221,7 @@ def _threshold_rows() -> list[Row]:
 
 
 def rc_rail(resistance: float, capacitance: float, density: float) -> tuple[float, float]:
-    """Return rate and variance of an RC rail under white current noise (result in 1/s)."""
+    """Return the rate, 1/s, and variance, V^2, of an RC rail under white current noise."""
     a = np.array([[-1.0 / (resistance * capacitance)]])
     b = np.array([[math.sqrt(density) / capacitance]])
     return (float(-np.linalg.eigvals(a)[0].real),

@@ -6,8 +6,8 @@ every row sums to zero.  Every state must be reachable from every other: then th
 (pi Q = 0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding
 times are exponential; the next state is drawn in proportion to the rates of the present one.
 
-A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t). The paper has two
-scalings with a small eps. Neither speeds up D and d, and eps = 1 leaves the system unchanged:
+A system switched by the chain is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t). The paper
+has two scalings with a small eps. Neither speeds up D and d; eps = 1 leaves the system unchanged:
 
 - averaging (eq. 1): clock 1/eps, speed 1; u^eps -> the averaged system.
 - diffusion (eq. 3): clock 1/eps^2, speed 1/eps, for A, a of zero average: the paths tend in law to
@@ -155,14 +155,14 @@ def matrix_model(alpha: float, omega: float, beta: float, alpha_p: float, *,
     """
     Return the deterministic matrix model of amplitude, phase and power (paper, 3.1).
 
-    u = (A, phi, P), du/dt = C u: damping of the amplitude alpha >= 0, 1/s, angular frequency of
-    the carrier omega, rad/s, coupling beta of the amplitude to the power, unit of P per unit of A
-    per second, and the power's relaxation rate alpha_p > 0, 1/s: the alpha of the
-    Ornstein-Uhlenbeck supply voltage.  Two entries of the printed matrix contradict the text
-    around them: +gamma on the diagonal makes the power grow as exp(gamma t), while only -alpha_p
-    makes it relax; and dphi/dt = omega phi makes the phase grow as exp(omega t), while a carrier
-    has dphi/dt = omega.  The default follows the text; `printed` follows the printed matrix, and
-    alpha_p is then the paper's gamma, of any sign.
+    u = (A, phi, P), du/dt = C u.  alpha >= 0, 1/s: damping of the amplitude; omega, rad/s: angular
+    frequency of the carrier; beta: coupling of the amplitude to the power, unit of P per unit of A
+    per second; alpha_p > 0, 1/s: relaxation rate of the power, the alpha of the Ornstein-Uhlenbeck
+    supply voltage.  Two entries of the printed matrix contradict the text around them.  +gamma on
+    the diagonal makes the power grow as exp(gamma t), but the power must relax (-alpha_p).
+    dphi/dt = omega phi makes the phase grow as exp(omega t), but a carrier has dphi/dt = omega.
+    The default follows the text; `printed` follows the printed matrix, and alpha_p is then the
+    paper's gamma, of any sign.
     """
     for name, value in (('alpha', alpha), ('omega', omega), ('beta', beta),
                         ('alpha_p', alpha_p)):

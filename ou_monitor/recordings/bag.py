@@ -48,7 +48,7 @@ def _qos() -> list[dict[str, Any]]:
 
 @one_line()
 def read_metadata(folder: Path) -> tuple[list[Path], dict[str, str]]:
-    """Return the MCAP files of a rosbag2 directory, as recorded, and its custom data."""
+    """Return the MCAP files of a rosbag2 directory, in recorded order, and its custom data."""
     path = folder / FILE
     where = path_words(path)
     content = read_yaml(path, 'the metadata', most_bytes=MOST_BYTES, most_nodes=MOST_NODES)
@@ -80,7 +80,7 @@ def is_part(file: Path, folder: Path) -> bool:
 
 
 def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, str], str]:
-    """Return the files of a bag as recorded, its custom data, and what is missing; '': nothing."""
+    """Return the files of a bag in recorded order, its custom data, and what is missing or ''."""
     if path.name == FILE and path.is_file():
         path = path.parent
     if not path.exists():
@@ -194,7 +194,7 @@ class BagReader:
 
     def tables(self, topics: Iterable[str], end_ns: int | None = None, *, as_written: bool = False,
                ) -> Iterator[Part]:
-        """Yield the messages as tables, chunks by time or as written, up to `end_ns`, ns."""
+        """Yield the messages as tables up to `end_ns`, ns; chunks in time or written order."""
         wanted = set(topics)
         for topic in sorted(wanted):
             if topic not in self.topics:
