@@ -90,7 +90,7 @@ class Filter:
             for i, j in np.argwhere(_pattern(loop)).tolist():
                 band[first - 1:end - 1, j, d + i - j] = -loop[i, j, first - begin:]
             if end - begin > 1:
-                # Of the last sample but one, as the gain in `__init__`.
+                # Take the last sample but one, whose gain `__init__` uses as the constant gain.
                 self._last_loop = loop[..., -2].copy()
         self._band_of_loop = band.reshape(n * d, 2 * d).T
         return variance
@@ -299,7 +299,7 @@ _AT_ONCE = 1024
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
     d, n = diagonal.shape[0], diagonal.shape[2]
-    # In LAPACK's order, column by column.  It is written in segments, because writing an element
+    # Stored in LAPACK's order, column by column.  Write it in segments, because writing an element
     # for all samples at once would cause cache misses.
     band = np.zeros((n, d, 2 * d))
     inside = [(i, j) for j in range(d) for i in range(j, d)]

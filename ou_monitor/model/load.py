@@ -1,8 +1,8 @@
 """
 The voltage of a battery under load, from throttle or current; start values for the next flight.
 
-Limits: the form and its constants were chosen on nine recordings (doc/load.md); charge is computed
-from the load, so if only throttle is known, wind and payload cause errors; all motors are alike.
+Limits: the form and its constants were chosen on nine recordings (doc/load.md).  Charge is
+computed from the load; if only throttle is known, wind and payload cause errors.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
 x = ul^p (E/3.8)^(p-1) exp(-k h), ul = LP(u, lag), dq = x dt / (mean x T),
@@ -11,7 +11,7 @@ with u throttle, E(s) of `open_circuit`, h Ohmic heat, and LP(x, tau) a low-pass
 
 The start values (`LoadStart`: the response to throttle, known at take-off) come from one craft and
 one pack on one day; the filter widens their errors by the scatter between packs.  They set no
-level for the next flight, because its charge at take-off is unknown.
+level for the next flight, because the pack's charge at take-off is unknown.
 """
 
 from __future__ import annotations
@@ -34,13 +34,14 @@ FULL_CELL = 4.25
 # to a common table for hobby cells (7.7 mV rms).
 _KNEE_SIZE, _KNEE_RATE = -0.39705, 35.0
 _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
-# Charge below which a straight line replaces the curve, and its slope, V: an error of a few per
-# cent in the charge must not put a prediction beyond the knee.  Slopes of 0.6 to 2.0 V work.
+# Charge below which a straight line replaces the curve, and slope of the line, V: an error of a
+# few per cent in charge must not put a prediction beyond the knee.  Slopes of 0.6 to 2.0 V work.
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
 # Relative change of the response per volt of a cell's open-circuit voltage, 1/V, because a pack
-# warms as it empties (the propellers' change is separate); its scatter between packs.  Measured
-# between halves of a flight or successive flights: 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro),
-# 0.5 (roma); mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
+# warms as it empties (the effect of the propellers is separate), and the scatter of this change
+# between packs.  Measured between halves of a flight or successive flights: 0.6 (gecko), 1.3
+# (nazgul), -0.1 +- 0.7 (hiro), 0.5 (roma); mean and prediction error by DerSimonian & Laird,
+# Control. Clin. Trials 7 (1986) 177.
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
@@ -109,8 +110,8 @@ class LoadModel:
     # Current at full load, A, negative if discharge currents are negative; 0: load is throttle.
     full_current: float = 0.0
     delay: float = 0.0  # Delay of the load behind the voltage, s
-    # Decrease of ln(resistance) per unit of charge and relative sag; without cooling (150 Wh/kg,
-    # 1 kJ/kg/K, -1.5 %/K) it would be 8.
+    # Decrease of ln(resistance) per unit of charge and relative sag; a pack without cooling (150
+    # Wh/kg, 1 kJ/kg/K, -1.5 %/K) would have 8.
     heating: float = 2.0
     constant_level: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
 
@@ -161,7 +162,7 @@ class LoadModel:
 # polarisation (2 and 15, rounded medians of `load_fit`).  They are a factor of 6 to 8 apart, so
 # that sums of their responses approximate any time constant up to 10 s.
 LAGS = (0.06, 0.35, 2.0, 15.0)
-# Those lags at which the response also has a part linear in throttle, s.
+# Those of LAGS after which the response has a part linear in throttle too, s.
 LINEAR_LAGS = (0.35, 2.0)
 # Number of coefficients: of x = u^1.8, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush.
 SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
@@ -193,7 +194,7 @@ class LoadStart:
     noise: float = 0.0
     noise_se: float = 0.0
     size_se: float = 0.0  # Relative standard error of the size of the response; 0: unknown.
-    # Mean open-circuit voltage of a cell where the size was measured, V; 0: unknown.
+    # Mean open-circuit voltage of a cell while the size was measured, V; 0: unknown.
     level: float = 0.0
     # Relative change of the size per volt of that level, 1/V, and its standard error.
     warming: float = WARMING
@@ -279,7 +280,7 @@ def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
     # - x: 1, less the parts of x after 60 ms and 0.35 s, less 0.7 times the parts of u and u^3.
     # The coefficient of x after a lag includes -0.7 times the part of u after that lag.
     # The deviations were chosen among six sets (0.1 to 0.3 for 0.35 s, 0.07 to 0.2 for u after a
-    # lag) on twelve recorded flights; their errors one second ahead differ by less than 1 %.
+    # lag) on twelve recorded flights, where prediction errors one second ahead differ by < 1 %.
     def lognormal(median: float, deviation: float) -> tuple[float, float]:
         mean = median * math.exp(0.5 * deviation ** 2)
         return mean, mean ** 2 * math.expm1(deviation ** 2)

@@ -1,7 +1,7 @@
 """
 The load model of a recording: a maximum a posteriori fit.
 
-Limits: the priors are narrow, to bound parameters that the recording does not determine; if a
+Limits: the priors are narrow, to bound parameters that the recording does not determine.  If a
 fitted parameter is three prior standard deviations from its centre, the model's form is wrong.
 Residuals are modelled as white noise and an OU with a time constant of 20 s and a few mV rms.
 """
@@ -44,8 +44,8 @@ _LEVEL_SD = 0.2
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
-# Bins over which the data are averaged before a fit: width, s (OU and polarisation are slower),
-# and maximum share of the recording.  Minimum number of samples.
+# Bins over which the data are averaged before a fit: width, s (slow error and polarisation are
+# slower), and maximum share of the recording.  Minimum number of samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
 # The slow error of the load model is an OU: its time constant, s, and the standard deviations
 # tried, V per cell (the maximum was chosen on the recordings).
@@ -68,7 +68,7 @@ class LoadFit:
     covariance: FloatArray
     condition: float  # Condition number of the Jacobian in prior deviations
     noise_std: float  # White noise of a 50 ms mean, V
-    slow_std: float  # Standard deviation of the OU of 20 s, V
+    slow_std: float  # Standard deviation of the slow error (an OU of 20 s), V
     evidence: float  # Log evidence (Laplace) for this load and this kind of level, nats
 
     def draw(self, rng: np.random.Generator) -> LoadModel:
@@ -133,7 +133,7 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     loads = np.stack((load, late)) - lowpass(load, t, slow)
 
     def fit(order: int, *shifts: int) -> tuple[float, float]:
-        """Return the squared residuals of `order`-th differences, and their product with load."""
+        """Return the squared residuals of `order`-th differences, and product load * voltage."""
         # X: the mean of the load over the shifts.
         X = np.diff(np.mean([[np.interp(t + shift * unit, t, row) for row in loads]
                              for shift in shifts], axis=0), order)
@@ -154,8 +154,8 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     inside = abs(best) < max(found)
     best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
     # A delay wrong by half a sample leaves glitch-like errors at steep changes of the load.  But a
-    # shift by part of a sample also smooths a noisy load.  So it must fit better than the mean of
-    # this shift and the opposite one, which is equally smooth.
+    # shift by part of a sample also smooths a noisy load.  So the shifted load must fit better
+    # than its mean with the oppositely shifted load, which is equally smooth.
     fine = {k: fit(1, best + k)[0] for k in range(-_SHIFTS, _SHIFTS + 1)}
     k = min(sorted(fine, key=abs), key=lambda k: fine[k])
     pays = min(fine[0], fit(1, best + k, best - k)[0]) > fine[k] * t.size ** (1.0 / t.size)
@@ -196,7 +196,7 @@ class _Noise:
         return self._found[1]
 
     def evidence(self, residuals: FloatArray) -> float:
-        """Return the log-likelihood, nats, of innovations under Student's t, 4 degrees."""
+        """Return the log-likelihood, nats, of innovations under Student's t (4 degrees)."""
         z, variance, _ = self.whiten(residuals)
         # With normal tails, a few short bursts of full throttle would dominate.
         return float(max(np.sum(-2.5 * np.log1p(0.25 * (z / size) ** 2)) + z.size * math.log(
@@ -221,7 +221,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         raise ValueError('a fit of the load needs throttle or current')
     full = delay = 0.0
     if current is None:
-        # The mean only scales `endurance`, so its exponent need not be the fitted `power`.
+        # The mean load only scales `endurance`, so 1.6 may differ from the fitted `power`.
         moving = load > 0.05
         mean = float((load[moving] ** 1.6).mean()) if moving.any() else 0.1
     else:

@@ -81,6 +81,6 @@ def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
 
 def steady(values: FloatArray) -> bool:
     """Return whether all values are equal."""
-    # Compare the last value first: if values vary, it mostly differs.
+    # Compare the last value first, because it mostly differs from the first if values vary.
     return not values.size or values.strides == (0,) or bool(
         values[0] == values[-1] and (values == values[0]).all())

@@ -51,7 +51,7 @@ _HATS, _PER_KNOT, _PARTS = 5.0, 5, 3
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 # Maximum shift of throttle and current, samples, and number of readings used to find it.
 _DELAYS, _DELAY_READINGS = 4, 8000
-# Maximum shift of a current, samples, if a larger shift is allowed by `reach`.
+# Maximum shift of a current, samples, even if `reach` allows more.
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01

@@ -156,6 +156,6 @@ def tones(v: FloatArray, white: FloatArray, rate: float, lowest: float = 0.0) ->
 
 def neighbours(ordinates: int, share: float = 1.0) -> int:
     """Return the number of neighbours, which is even and grows with the length of the piece."""
-    # share: length of the piece relative to a short one; the neighbours span the same band in Hz.
+    # share: length of the piece relative to a short one, so that neighbours span equal bands, Hz.
     there = max(2, (ordinates - 2 * GUARD) // 4 * 2)
     return min(there, NEIGHBOURS * min(_MORE, max(1, int(share))))

@@ -16,7 +16,7 @@ the length in which the line was found; this also removes a little noise.
 
 Limits: the noise is treated as constant over the neighbours (about 60 bins on either side).  A
 line must also exceed the nearest eight ordinates on either side, so that a slope or a wide hump of
-the noise does not count as a line; a resonance narrower than these does.  Samples are treated as
+the noise does not count as a line; a narrower resonance does.  Samples are treated as
 evenly spaced; a line may be an alias; frequencies below `FIRST` periods per piece are not
 searched.  A line whose frequency changes is spread over bins, and may be missed.  If a tone moves
 by more than a bin within a piece, or is modulated, its sidebands remain.

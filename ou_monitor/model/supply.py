@@ -142,9 +142,9 @@ class Simulation:
 
     Except for rounding, a seed gives the same samples for any division into segments.
     `resistance` multiplies the response to throttle (above 1: an old pack), and may change between
-    segments.  With `charge` (0..1, at the first sample), the level falls as throttle discharges
-    the pack (`model.load`), which replaces the `drift` term; NaN: the charge that matches the
-    model's level.
+    segments.  With `charge` (at the first sample, 0..1; NaN: the charge that matches the model's
+    level), the level falls as throttle discharges the pack (`model.load`).  This replaces the
+    `drift` term.
     """
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator, *,

@@ -193,8 +193,8 @@ class CrossSpectrum:
     def cost(self, S: FloatArray, used: int | None = None
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return minus the restricted log-likelihood of spectra, shape (k, bins), and more."""
-        # Results: the cost, minimised over a factor on each spectrum, shape (k,); these factors;
-        # the products x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
+        # Results: the cost, minimised over a factor on each spectrum, shape (k,); the factors; the
+        # products x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
         # Keep the matrices positive definite despite rounding.
         gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10
