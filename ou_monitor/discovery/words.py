@@ -34,8 +34,8 @@ VAGUE_NUMBER = 'not determined'
 _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
     ('band', 'the spectrum has too much or too little power in some band'),
-    ('line', 'the spectrum has a line'),
-    ('order line', 'the frequency of a line follows throttle'),
+    ('line', 'the spectrum has a narrow peak'),
+    ('order line', 'a narrow peak of the spectrum follows throttle'),
     ('skewness', 'prediction errors are skewed'),
     ('kurtosis', 'prediction errors have tails that are too heavy or too light'),
     ('tails', 'there are too many outliers'),
@@ -358,8 +358,8 @@ PLAIN_NAMES = {
     'resonance': 'ringing of leads and capacitors',
     'saturation': 'clipping at the end of the range of the ADC',
     'second_relaxation': 'a second time constant',
-    'throttle_tone': 'a line that follows the motors',
-    'tone': 'a line at a fixed frequency',
+    'throttle_tone': 'a spectral line that follows the motors',
+    'tone': 'a spectral line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
 # Names with an underscore; the others are English words.

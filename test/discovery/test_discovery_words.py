@@ -109,7 +109,7 @@ def test_each_verdict_has_its_sentence(verdict, named, left, words):
     found = finding(verdict, [tone_cause(31.0, '')] * named, [left_over('skewness')] * left)
     text = ' '.join(verdict_words(found, doubts=['too slow'] if 'slow' in words else []))
     assert words in text and ('mnat' in text) == named
-    assert ('A plain simulation lacks a line' in text) == named
+    assert ('A plain simulation lacks a spectral line' in text) == named
 
 
 def test_the_answer_begins_with_the_largest_gains():

@@ -24,7 +24,7 @@ from ou_monitor.text import printable
 GROUP = 'ou_monitor.causes'
 # Maximum length of a sentence on a cause that was left out, characters.
 _LONGEST = 200
-# For each cause of another package that failed, by name: the reason, a sentence.
+# Causes of other packages that failed: name -> the reason, a sentence.
 _left_out: dict[str, str] = {}
 
 
@@ -67,7 +67,7 @@ def blamed(error: BaseException) -> tuple[str, ...]:
 
 
 def withdraw(error: BaseException) -> bool:
-    """Remove the installed causes that raised an error, or else all; return whether any is."""
+    """Remove the installed causes that raised an error, or else all; return whether any was."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)

@@ -1,4 +1,4 @@
-"""The data (`View`) to which laws of the innovations are fitted, and functions shared by laws."""
+"""The data (`View`) to which laws of the innovations are fitted, and functions for laws."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _parabola(found: FloatArray, size: int, step: float) -> tuple[FloatArray, Fl
 def _errors(bend: FloatArray) -> FloatArray:
     """Return joint standard errors from second derivatives of a log-likelihood."""
     errors, slope = np.full(bend.shape[0], math.nan), bend.diagonal()
-    # Leave out parameters without effect or at a limit: they must not affect the others' errors.
+    # Leave out parameters without effect or at a limit, which must not affect the other errors.
     kept = np.flatnonzero(np.isfinite(slope) & (slope < 0.0))
     scale = np.sqrt(-slope[kept])
     curve, axes = np.linalg.eigh(-bend[np.ix_(kept, kept)] / np.outer(scale, scale))

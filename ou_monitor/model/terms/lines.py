@@ -1,4 +1,4 @@
-"""Functions shared by the terms for lines: states, and detection of broad and moving lines."""
+"""Functions for the terms of spectral lines: states, and detection of broad and moving lines."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
 _INDEPENDENT = 0.02
 # Maximum slope, in sampling rates: from idle to full throttle a line may fold once and return.
 _REACH = 1.0
-# Length of the long segments over the short ones, which show lines while throttle moves fast.
+# Ratio of long to short segments; short segments show lines while throttle moves fast.
 _SHORTER = 8
 
 
@@ -164,7 +164,7 @@ class _Line:
 
 
 def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line]:
-    """Return for each slope the line with the best idle, strongest first."""
+    """Return for each slope the line with the best idle frequency, strongest first."""
     count = z.size // length
     if count < 8 or np.ptp(u) < 0.02:
         return []
@@ -205,7 +205,7 @@ def _unwound(z: FloatArray, u: FloatArray, rate: float) -> list[_Line]:
     # From one slope to the next, the phase changes by half a cycle within a segment in which
     # throttle moves much (90 % quantile).
     step = 0.5 / max(float(np.percentile(np.ptp(moves, axis=1), 90.0)), 1e-6)
-    # A negative slope is that of the mirrored line, at negative frequencies.
+    # A line with a negative slope is found as its mirror image at negative frequencies.
     slopes = np.arange(0.0, _REACH * rate, step)
     if slopes.size * z.size > _DEAREST:
         return []
@@ -225,7 +225,7 @@ def _unwound(z: FloatArray, u: FloatArray, rate: float) -> list[_Line]:
     return found[:_MOST]
 
 
-# Length of these segments, s; maximum product of slopes and samples: 1 s of processor time.
+# Length of the segments of `_unwound`, s; maximum slopes x samples: 1 s of processor time.
 _UNWOUND, _DEAREST = 1.0, 3e7
 
 

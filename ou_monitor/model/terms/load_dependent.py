@@ -18,7 +18,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class LoadDependentSigma(Term):
-    """Multiply sigma by a factor; its ln is linear between knots, and constant beyond them."""
+    """Multiply sigma by a factor whose ln is linear between knots, and constant beyond them."""
 
     NAME: ClassVar[str] = 'load_dependent_sigma'
     FAMILY: ClassVar[str] = 'intensity'
@@ -57,7 +57,7 @@ class LoadDependentSigma(Term):
         s.sigma *= np.exp(np.interp(s.throttle, self.throttle, self.log_factor))
 
     def free(self) -> tuple[str, ...]:
-        """Return the knots to fit: all but the first, where sigma is the OU's."""
+        """Return the log factors to fit: all but the first, where sigma is the OU's."""
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
@@ -120,7 +120,7 @@ Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
-    """Return mean input, ln of the scores' std, and count of each bin with enough scores."""
+    """Return mean input, ln of the scores' std, and count, for each bin with enough scores."""
     last = edges.size - 2
     where = np.clip(np.searchsorted(edges, x, side='right') - 1, 0, last)
     count = np.bincount(where, minlength=last + 1).astype(np.float64)
@@ -292,8 +292,8 @@ class LoadDependentNoise(Term):
         'The white noise of the readings grows with throttle or its changes: ripple of the ESCs, '
         'or a rail that relaxes faster than the sampling, which looks the same.')
     REMEDY: ClassVar[str] = by_parameters(
-        'Sample faster to tell them apart; against ripple, add capacitance at the ESCs or a '
-        'filter before the ADC. Give readings at high throttle less weight.',
+        'Sample faster to tell ripple from a fast rail; against ripple, add capacitance at the '
+        'ESCs or a filter before the ADC. Give readings at high throttle less weight.',
         lambda term: LoadDependentNoise.REMEDY if 0 in term.number else
         LoadDependentNoise.REMEDY.replace('at high throttle', 'soon after changes of throttle'))
     SEPARATED_BY: ClassVar[str] = (

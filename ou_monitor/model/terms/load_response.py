@@ -15,9 +15,8 @@ from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, 
 from ou_monitor.records import FloatArray
 
 
-# Evidence required for a growth in addition to the penalty of its parameter, nats (as much as for
-# a cause).  Without this requirement, a growth was found in 5 of 72 simulated flights with a
-# steady sag; with it, in none.
+# Evidence required for a growth in addition to the penalty of its parameter, nats.  Without this
+# requirement, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
 _GROWS = 6.0
 
 
@@ -43,8 +42,8 @@ class LoadSag(Term):
     MEASURED: ClassVar[bool] = True
     LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'The mean falls with throttle: IR drop of battery, leads and regulator. These are settled '
-        'values; sag and resistance of the supply refer to 1 s after a step.')
+        'The mean falls with throttle: IR drop of battery, leads and regulator. The estimates are '
+        'settled values; sag and resistance of the supply refer to 1 s after a step.')
     REMEDY: ClassVar[str] = (
         'Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
         'reduce it.')
@@ -210,7 +209,7 @@ _ABOUT = {
     (True, False): ('Part of the fall after a rise of throttle recovers while throttle is held: a '
                     'regulator corrects it, or a battery warms.',
                     LoadTransient.REMEDY)}
-# Number of delays to try, and the longest delay, s.
+# Number of delays to try, and maximum delay, s.
 _DELAYS, _LATEST = 12, 0.1
 # Time constant, in durations of the recording, for a response that never decays.
 _LASTING = 100.0

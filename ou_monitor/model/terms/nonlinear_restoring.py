@@ -163,8 +163,8 @@ def _maximise(density: Callable[[FloatArray], FloatArray], b: FloatArray, error:
 
 # Minimum cube, in square^2/alpha (above 1/4 the force has only one zero).
 _HOLDS = 0.26
-# Slope of the force times the step: maximum, minimum, and maximum in one part of a step; maximum
-# number of parts.
+# Slope of the force times the step: maximum, minimum, and maximum in one part of a step.  Maximum
+# number of parts of a step.
 _STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
 # Maximum number of rounds of scoring, and minimum gain of a round to start another, nats.
 _ROUNDS, _SETTLED = 5, 0.05

@@ -31,8 +31,8 @@ class MeasurementNoise(Term):
         'The readings have white noise: from the sensor, or from a rail that relaxes faster than '
         'the sampling, which looks the same.')
     REMEDY: ClassVar[str] = (
-        'Sample faster to tell them apart; if it is the sensor, average in the ADC or use a finer '
-        'range. Alpha and sigma fitted without this noise are too high.')
+        'Sample faster to tell sensor noise from a fast rail; against sensor noise, average in '
+        'the ADC or use a finer range. Alpha and sigma fitted without this noise are too high.')
     SEPARATED_BY: ClassVar[str] = (
         'the same rail at several times the sampling rate, or the input of the ADC shorted')
 
@@ -113,7 +113,7 @@ class LopsidedNoise(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit scores that are mostly white noise; their scale is free."""
+        """Fit the scores, if they are mostly white noise; their scale is free."""
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         found, paid = cls._best_fit(view)
         # Other causes describe heavy tails without asymmetry.
@@ -304,12 +304,12 @@ class ClockJitter(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a starting point for errors that are visible on the slopes of pure lines."""
+        """Return a starting point for errors that are visible on the slopes of pure tones."""
         square = np.square(np.broadcast_to(view.slope, view.z.shape)[view.train])
         usual = float(square.mean())
         if not float(square.std()) > 0.0:
             return ()
-        # Score test: whether the errors are larger where the lines are steeper.
+        # Score test: whether the errors are larger where the tones are steeper.
         x, e = square - usual, np.square(view.z[view.train])
         score = float(x @ e) / (math.sqrt(x.size) * float(x.std()) * float(e.std()))
         std = math.sqrt(float(np.median(view.variance)) / (2.0 * usual))
@@ -317,7 +317,7 @@ class ClockJitter(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit the unknown errors of the stamps, which show because longer steps add more noise."""
+        """Fit the errors of the stamps, which are visible because longer steps add more noise."""
         return cls._best_fit(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:
@@ -359,7 +359,7 @@ class ClockJitter(Term):
 
 @dataclass(frozen=True)
 class JitterOnLines(ClockJitter):
-    """The same errors on the slopes of pure lines: white noise in proportion to the slope."""
+    """Errors of stamps that are visible on pure tones: white noise in proportion to the slope."""
 
     ROLE: ClassVar[Role] = Role.NOISE
     FREE: ClassVar[tuple[str, ...]] = ('std',)
@@ -374,7 +374,7 @@ class JitterOnLines(ClockJitter):
 
 
 # Maximum standard deviation of the errors of stamps, in steps; minimum score, in standard errors,
-# for a fit of errors on lines (half of its square is 6 nats, the evidence that a cause needs).
+# for a fit of errors on tones (half of its square is 6 nats; a cause needs 4 after its penalties).
 _MOST_ERROR, _STEEPER = 0.45, 3.5
 
 

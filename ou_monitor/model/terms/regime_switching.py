@@ -114,7 +114,7 @@ class Scores:
         exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
         for off, high, keep, draw, slow in columns:
-            # With at_once the filter follows the level, otherwise the rail, which lags behind it.
+            # With at_once the filter follows the level, otherwise the rail, which lags the level.
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind
@@ -340,8 +340,8 @@ def _fit_again(fit: LawFit, start: Start, view: View) -> Start:
 _MOST = 5_000_000
 
 
-# Minimum number of complete stays in a state, and coefficient of variation below which they count
-# as even: that many exponential times have a lower coefficient with a probability of 1e-3.
+# Minimum number of complete stays in a state, and coefficient of variation below which the stays
+# count as even: ten exponential times have a lower coefficient with a probability of 1e-3.
 _STAYS, _EVEN = 10, 0.35
 
 
@@ -569,7 +569,7 @@ def _counted_rates(before: FloatArray, step: float) -> FloatArray:
 
 
 def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
-    """Return a start for levels much slower than the noise, its evidence, and their number."""
+    """Return a start for levels much slower than the noise, its evidence, and number of levels."""
     # Means over half a relaxation time are modelled as levels plus first-order noise.  The
     # correlation of this noise is fitted too, because the correlation of the samples includes the
     # levels.

@@ -174,8 +174,8 @@ class Glitches(Term):
     def fit_law(cls, view: View) -> LawFit | None:
         """Find runs of up to three samples that contradict their neighbours on both sides."""
         # Use errors and variances of a filter without measurement noise, in which a sample affects
-        # only the next sample.  Take the scale from a median, because bad samples have increased
-        # the fitted noise.
+        # only its own error and the next.  Take the scale from a median, because bad samples have
+        # increased the fitted noise.
         own = view.variance * (view.driven + (1.0 - view.trust) * (1.0 + view.phi ** 2))
         plain = (view.residual - view.phi * view.state) / np.sqrt(own)
         unit = float(np.median(np.abs(plain))) / 0.6745
@@ -329,7 +329,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """Make each step's noise Student-t with equal variance; dof is valid for one step length."""
+    """Make each step's noise Student-t, with the same variance; dof is for one step length."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'

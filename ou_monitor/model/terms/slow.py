@@ -35,7 +35,7 @@ class Drift(Term):
             'rate', *(name for name in ('curvature', 'charge') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
-    # The form of a larger effect is never exact, which leaves a little for a trend to explain.
+    # The form of a larger effect is never exact, and a trend may explain the little that is left.
     LEAST_SHARE: ClassVar[float] = 0.02
     MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
     REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'
@@ -93,7 +93,7 @@ class SecondRelaxation(Term):
     RECURS: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
         'A second relaxation, with its own rate, adds to the first: a second storage element.')
-    REMEDY: ClassVar[str] = 'Keep both in the model; one alpha alone describes neither.'
+    REMEDY: ClassVar[str] = 'Keep both relaxations in the model: a single alpha describes neither.'
     SEPARATED_BY: ClassVar[str] = 'a recording ten times as long, throttle held still'
 
     alpha: float = parameter('1/s', 'its relaxation rate', 0.0, above=True)
@@ -124,7 +124,7 @@ class SecondRelaxation(Term):
         return [*found, cls(6.0 * rate, 0.3 * spread * math.sqrt(12.0 * rate))]
 
     def holds(self, view: View) -> bool:
-        """Return whether it relaxes within the recording, but not within a step."""
+        """Return whether the relaxation fits into the recording, but not into a step."""
         return _LEAST / float(view.at[-1]) < self.alpha < _LEAST * view.rate
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -170,7 +170,7 @@ class FlickerNoise(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
     MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
     REMEDY: ClassVar[str] = (
-        'Alpha holds only for windows of this length; compare only windows of equal length.')
+        'Alpha depends on the length of the window: compare only windows of equal length.')
     SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
 
     amplitude: float = parameter('V', 'square root of (f times PSD)', 0.0)
@@ -243,7 +243,7 @@ class FlickerNoise(Term):
         return (cls(spread * math.sqrt(0.3 / math.log(_CORNER * high / low)), low, high),)
 
     def holds(self, view: View) -> bool:
-        """Return whether the range of 1/f is too wide for a relaxation."""
+        """Return whether the range of 1/f is too wide to be one or two relaxations."""
         return bool(_CORNER * self.high > _LEAST_SPAN * self.low)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:

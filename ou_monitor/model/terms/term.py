@@ -109,7 +109,7 @@ class Term:
     # causes.
     MEASURED: ClassVar[bool] = False
     # Causes that are hard to distinguish from this one: the search does not add one of such a pair
-    # to the other.  One of the two classes has to name the other.
+    # to the other.  It suffices that one of the two classes names the other.
     IMITATES: ClassVar[tuple[str, ...]] = ()
     # Whether a model can have several terms of this class, and whether the search looks for more
     # after it has found one.
@@ -156,7 +156,7 @@ class Term:
         self.check()
 
     def check(self) -> None:
-        """Check relations between parameters; the base has none."""
+        """Check relations between parameters; the base class has none."""
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Return a function that applies the term to one `Segment` after another, in order."""
@@ -310,7 +310,7 @@ class LawFit:
     # Factor on the variance of the OU noise in the step before each sample: the inverse of the
     # mean precision; shape (n,).
     power: FloatArray | None = None
-    white: FloatArray | None = None  # The same for the variance of the white noise; shape (n,)
+    white: FloatArray | None = None  # Like `power`, for the white noise; shape (n,)
     # Voltage that the law adds to the level, V; subtracted before the Gaussian fit; shape (n,).
     offset: FloatArray | None = None
 

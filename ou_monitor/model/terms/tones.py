@@ -40,7 +40,7 @@ class Tone(Term):
     RECURS: ClassVar[bool] = True
     MAY_LEAVE: ClassVar[float] = 0.3
     MEANING: ClassVar[str] = (
-        'A line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.')
+        'A spectral line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.')
     REMEDY: ClassVar[str] = (
         'Find the source from its frequency; sample at another rate to identify an alias.')
     SEPARATED_BY: ClassVar[str] = (
@@ -79,7 +79,7 @@ class Tone(Term):
         return cls(0.0, wave.frequency, 0.0, 0.0)
 
     def holds(self, view: View) -> bool:
-        """Return whether it is a line rather than ringing."""
+        """Return whether this is a line rather than ringing."""
         return self.linewidth < SHARP * self.frequency and (
             self.linewidth < WIDEST
             or not power_spread(view, self.frequency, self.linewidth) > CONSTANT)
@@ -119,8 +119,8 @@ def lines_of(view: View) -> tuple[Line, ...]:
 # Maximum number of lines tried, and their false-alarm probability, which is large because the
 # evidence decides later.
 _MOST, _PROPOSED = 3, 0.5
-# A fit starts from two linewidths: _WANDERS, in units of the recording's resolution, and the
-# geometric mean of that and the maximum.  A line wider than WIDEST, Hz, must have a constant
+# A fit starts from two linewidths: _WANDERS times the resolution of the recording, and the
+# geometric mean of this and the maximum.  A line wider than WIDEST, Hz, must have a constant
 # amplitude; otherwise it is ringing.
 _WANDERS, WIDEST = 3.0, 2.0
 # Maximum width of a line relative to its frequency.
@@ -215,9 +215,9 @@ class Resonance(Term):
                         self.tilt * self.damping / (2.0 * math.pi * self.frequency))
 
     def holds(self, view: View) -> bool:
-        """Return whether it oscillates, and decays faster than a line."""
+        """Return whether this oscillates, and decays faster than a line."""
         width = self.damping / math.pi
-        # It is ringing if it is too wide for a tone, or if its amplitude varies.
+        # It is ringing if its line is too wide for a tone, or if its amplitude varies.
         return width < 2.0 * self.frequency and (width >= SHARP * self.frequency or (
             width > WIDEST and not power_spread(view, self.frequency, width) < RINGING))
 
@@ -243,7 +243,7 @@ class ThrottleTone(Term):
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
     MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = 'A line whose frequency follows throttle: commutation of the motors.'
+    MEANING: ClassVar[str] = 'A spectral line that follows throttle: commutation of the motors.'
     REMEDY: ClassVar[str] = 'Add capacitance at the ESC, or a notch that follows throttle.'
     SEPARATED_BY: ClassVar[str] = 'a slow sweep of throttle'
 

@@ -192,7 +192,7 @@ def _kernels(keep: FloatArray) -> FloatArray:
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return prior of the levels and log density in each segment, and the levels, by point."""
+    """Return for each point: prior of levels and log density in each segment, and the levels."""
     reach = math.sqrt(_LEVELS - 1.0)
     std = np.exp(points[:, :1])
     levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
