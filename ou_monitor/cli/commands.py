@@ -159,7 +159,7 @@ CSV = (
            help='unit of the throttle in a CSV: 0..1, percent, pulses of 1000 to 2000 us, or the '
            'values at zero and full throttle, as --throttle-unit=-1024:1024 (default: detected)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
-           help='time from row to row of a CSV, s, in place of a column'),
+           help='time between rows of a CSV without a column of time, s'),
     Option('--delimiter', metavar='C',
            help="separator of the cells of a CSV: a character, 'tab' or 'space' (default: "
            'detected)'),
@@ -172,9 +172,9 @@ COLUMNS = (
            help='column of a CSV (default: found by its name), or series of a log (default: the '
            'battery)'),
     Option('--throttle-column', metavar='NAME',
-           help="column of a CSV or series of a log, or 'none' (default: found)"),
+           help="column of a CSV or series of a log, or 'none' (default: detected)"),
     Option('--current-column', metavar='NAME',
-           help="column of a CSV or series of a log, or 'none' (default: found)"),
+           help="column of a CSV or series of a log, or 'none' (default: detected)"),
     *CSV)
 FILES = (
     Option('--flight', metavar='N', type=FLIGHT,
@@ -272,7 +272,7 @@ _ANALYZE = Command(
     'ou_monitor.cli.recorded:analyze',
     'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
     '95 % intervals, and the type of process.',
-    (RECORDING, levels('found'), *PART,
+    (RECORDING, levels('detected'), *PART,
      *estimate('lowest permitted voltage, V (default: 4.5 for a 5 V rail)'),
      *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --cells 4 --report flight.html',
@@ -287,11 +287,11 @@ _COMPARE = Command(
     'Without --model, a model is fitted to the part before --fit-until; the rest is simulated.',
     (RECORDING, *PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
-            help='simulate this model, as discover --save-model writes it; its level is moved to '
-            'the level of the first seconds'),
+            help='simulate this model (from discover --save-model), with its level moved to the '
+            "level of the recording's first seconds"),
      Option('--fit-until', metavar='S', type=TIME,
-            help='start of the simulation, s after the first sample (default: half of the '
-            'recording; with --model its start)'),
+            help='start of the simulation, s after the first sample (default: the middle of the '
+            'recording; with --model, its first sample)'),
      Option('--seeds', metavar='N', type=whole('a whole number, 20 to 10000', 20, 10_000),
             default=50, help='simulations (default: %(default)s)'),
      seed(0, 'same seed, same simulations'),
@@ -318,11 +318,11 @@ _CONVERT = Command(
             help="throttle, or 'none' (default: motors, else the command to them, else "
             'the stick)'),
      Option('--current', metavar='NAME',
-            help="current, or 'none' (default: from the sensor of the voltage)"),
+            help="current, or 'none' (default: from the same sensor as the voltage)"),
      Option('--signal', metavar='NAME', action='append', default=[],
             help='any other series, as a topic of its own; may be given several times'),
      Option('--imu', metavar='NAME',
-            help="gyro for /imu, or 'none' (default: the first of the list)"),
+            help="gyro for /imu, or 'none' (default: the first that --list shows)"),
      Option('--poles', metavar='N', type=whole('an even number from 2 on', 2, step=2),
             help='magnets of a rotor, for eRPM (default: as the log says)'),
      Option('--flight', metavar='N', type=FLIGHT,
@@ -355,12 +355,13 @@ _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
-    'power network, for a range of bulk capacitances; find the smallest that keeps to --risk.',
+    'power network, for a range of bulk capacitances; find the smallest that keeps the risk below '
+    '--risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
-            help='take level, sag, resistance and noise from a recording; --set overrides it '
-            '(cells=0: the voltage is of a rail, not a pack)'),
+            help='take level, sag, resistance and noise from a recording; --set overrides its '
+            'values (--set cells=0: the recording is of a rail, not of a pack)'),
      Option('--risk', metavar='X', type=PROBABILITY, default=0.01,
-            help='probability of a brown-out allowed within the horizon, 0..1 (default: '
+            help='highest allowed probability of a brown-out within the horizon, 0..1 (default: '
             '%(default)s, as for the throttle budget of analyze)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
@@ -376,8 +377,8 @@ _DESIGN = Command(
      Option('--capacitance-max', metavar='F', type=quantity('F'), default='22mF',
             help='largest capacitance to try (default: %(default)s)'),
      Option('--esr-fixed', action='store_true',
-            help='keep the ESR (default: ESR falls as 1/C, as with more capacitors of one series '
-            'in parallel)'),
+            help='keep the ESR (default: ESR falls as 1/C, as with more equal capacitors in '
+            'parallel)'),
      Option('--set', metavar='NAME=VALUE', action='append', default=[],
             help='a component, such as bulk_capacitance=1000uF; may be repeated (see --list)'),
      Option('--network', metavar='FILE.yaml',
@@ -421,8 +422,8 @@ _FLEET = Command(
      Option('--insecure', action='store_true',
             help='allow a scheduler on another machine without TLS'),
      Option('--vehicle-from', metavar='REGEX',
-            help='regular expression for the path, whose first group (or whole match) is the '
-            'vehicle, if the metadata do not name it (default: the folder is the vehicle)'),
+            help='regular expression to search in the path: its first group (or whole match) is '
+            'the vehicle if the metadata do not name one (default: the folder is the vehicle)'),
      Option('--discover', action='store_true',
             help='also search for causes; takes a few seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),
@@ -479,7 +480,7 @@ _SIMULATE = Command(
             '%(default)s)'),
      Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
             help='print the parameters of the model for another simulator (gazebo, px4, '
-            'ardupilot, json), and what they omit under --throttle'),
+            'ardupilot, json), and the effect, under --throttle, of what they omit'),
      Option('--full-current', metavar='A', type=POSITIVE, default=math.nan,
             help='with --export: current at full throttle'),
      Option('--output', metavar='PATH', type=path_argument,

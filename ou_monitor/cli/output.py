@@ -32,7 +32,7 @@ _LEAST = 0.02
 
 
 class Progress:
-    """Progress of a command on standard error; `quiet`: no lines without a terminal."""
+    """Progress of a command on standard error (quiet: nothing unless that is a terminal)."""
 
     def __init__(self, label: str, quiet: bool = False) -> None:
         self._label, self._quiet = label, quiet
@@ -101,7 +101,7 @@ _NO_FILE = 'No file was written: --report FILE.html saves a report, --json FILE 
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
-# Endings that a bag must not have: a folder with such a name would mislead.
+# Endings that the name of a bag must not have, because they promise another format.
 _NO_BAG = ('.bag', '.bbl', '.bfl', '.bin', '.csv', '.db3', '.json', '.log', '.txt', '.ulg',
            '.yaml', '.yml')
 
@@ -200,7 +200,7 @@ def _existing(what: str) -> InputError:
 
 
 def check_bag(name: str, bag: Path, force: bool) -> None:
-    """Refuse a bag that cannot be written, before the work starts; `replacing` checks again."""
+    """Refuse a bag that cannot be written, before the work starts (`replacing` checks again)."""
     if bag.suffix.lower() in _NO_BAG:
         raise InputError(f"{name} '{bag}': {bag.suffix} is not written; give NAME.mcap for one "
                          'file, or NAME for a rosbag2 folder')

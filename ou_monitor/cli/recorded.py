@@ -106,7 +106,7 @@ def _unsaved(why: str) -> str:
 
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
-    """Return the extended model, and start values for the next flight, as a model file's text."""
+    """Return a model file's text: the extended model, and start values for the next flight."""
     from ou_monitor.online.load.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
     from ou_monitor.records import plain_data
@@ -120,7 +120,7 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
         'ou_monitor': __version__, 'verdict': finding.verdict.value,
         'heldout_score': finding.score, 'gain': finding.gain,
         'gain_se': finding.gain_se, 'seed': finding.seed,
-        # Rate at which `simulate` draws the model.
+        # Default rate of `simulate --model`.
         'rate_hz': float(f'{(finding.n - 1) / finding.duration:.6g}')})
     loads = LoadFilter()
     if recording is not None:

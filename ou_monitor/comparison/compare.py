@@ -29,11 +29,11 @@ from ou_monitor.text import counted, number, percent
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Maximum points of the band on a page.
 _POINTS = 2000
-# Minimum probability of the other kind of level (constant or falling) to be reported.
+# Probability above which the other kind of level (constant or falling) is reported.
 _UNSURE = 0.05
-# Minimum time at the beginning over which a model from a file is aligned with the recording, s.
-# This time is doubled until the mean over it scatters between simulations by less than the given
-# share of the scatter of single samples, so that it holds about ten independent pieces.
+# Minimum time over which a model from a file is aligned with the beginning of the recording, s;
+# doubled until the mean over it scatters, between simulations, by at most `_STEADY` of the scatter
+# of single samples, so that it holds about ten independent pieces.
 _ALIGNED, _STEADY = 2.0, 0.3
 
 
@@ -88,7 +88,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         if not np.isfinite(v).all():
             raise InputError('the model diverges over this throttle: its voltage is not finite')
         if aligned is not None:
-            # Aligned one by one, so that the bands include the error of the level.
+            # Align each simulation by itself, so that the bands include the error of the level.
             shifts[k] = (own.voltage[aligned] - v[aligned]).mean()
             v = v + shifts[k]
         total += v
@@ -125,7 +125,7 @@ def _beginning(t: FloatArray, drawn: FloatArray, stride: int) -> slice:
 
 
 def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
-    """Return the readings without repeats, from 0 s on, and the stamp of the first, s."""
+    """Return the readings without repeats, with stamps from 0 s on, and the first stamp, s."""
     t, v, u = usable(recording, notes)
     if v.size < 2 * _LEAST:
         raise InputError(f"'{recording.name}' holds {counted(v.size, 'usable sample')}; a "
@@ -184,7 +184,7 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
 
 def _checked_load(model: SupplyModel, samples: Readings, name: str, notes: list[str]
                   ) -> Readings:
-    """Return the readings with late current corrected; raise InputError without the load."""
+    """Return the readings with late current corrected; InputError if the load is missing."""
     needs = model.needs_throttle
     if model.full_current:
         if needs and samples.current is None:

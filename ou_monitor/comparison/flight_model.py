@@ -88,8 +88,8 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
-# Errors are drawn from readings of similar noise size: share of all readings taken on either side,
-# and their minimum number; difference of ln(size) up to which sizes count as equal.
+# Errors are drawn from the readings of the nearest noise sizes: share of all readings, and minimum
+# number, on either side; difference of ln(size) up to which sizes count as equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
 # Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3
@@ -111,7 +111,7 @@ class FlightNoise:
         """Return n samples of noise, V, under a throttle or current."""
         wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
         # Draw a reading of the same noise size (within rounding), then one of its neighbours by
-        # size; their number is the same near the ends.
+        # size; the number of neighbours is the same near the ends.
         first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
         last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
@@ -177,7 +177,7 @@ class FlightModel:
     """Load model, slow process, OU and white noise, as fitted to a part of a recording."""
 
     load: LoadFit | None  # The response to the load; None if there is only a level
-    # The same with the other kind of level, constant or discharging, and its probability.
+    # The response fitted with the other kind of level, constant or discharging; its probability.
     other: LoadFit | None
     doubt: float
     # Level, V, without a load model, and its standard error.
@@ -239,7 +239,7 @@ def _simulated_load(fit: LoadFit | None, samples: Readings) -> FloatArray | None
 
 @dataclass(frozen=True, eq=False)
 class FiledModel:
-    """A model from a file, simulated at the readings only, without repeats."""
+    """A model from a file, simulated without repeats and ADC steps."""
 
     model: SupplyModel
 
@@ -382,5 +382,6 @@ def _sag_error(held_out: list[tuple[FloatArray, FloatArray]]) -> float:
         weight = float(moved @ moved)
         squares += float(moved @ (voltage - path)) ** 2 / max(weight, 1e-300)
         weights += weight
-    # If parts scatter by s, these errors do by s sqrt(1 + 1/3); means of four parts by s / 2 each.
+    # If parts scatter by s, one differs from the mean of three by s sqrt(1 + 1/3), and a mean of
+    # four from another by s sqrt(1/4 + 1/4).
     return math.sqrt(3.0 / 8.0 * squares / max(weights, 1e-300))

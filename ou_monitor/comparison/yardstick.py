@@ -97,7 +97,7 @@ class Traces:
     simulated_distribution: FloatArray
 
 
-# Number of rows (of 12) outside their 95 % bands that only 2 % of good simulations reach.
+# Number of rows outside their 95 % bands that 2 % of good simulations with 12 rows reach.
 _TOO_MANY = 3
 
 
@@ -129,7 +129,7 @@ class Agreement:
     # Largest difference (KS) from the joint distribution of all simulations.
     apart: Band
     seeds: int
-    p_value: float  # Share of simulations and recording with at least the recording's score
+    p_value: float  # Share, of simulations and recording, with at least the recording's score
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
     farthest: str  # Kind of that difference: a key of _WEIGHTS, or path
@@ -138,7 +138,7 @@ class Agreement:
 
     @property
     def in_part(self) -> bool:
-        """Return whether more numbers are outside their own bands than chance explains."""
+        """Return whether more numbers are outside their bands than chance explains."""
         return sum(not one.inside for *_, one in self.rows()) >= _TOO_MANY
 
     @property
@@ -341,8 +341,8 @@ class Difference:
 
 def band(measured: float, simulated: FloatArray) -> Band:
     """Return a number of the recording with the band of the simulations, shape (seeds,)."""
-    # By this method, 95 % of further simulations lie in low..high; by NumPy's default method, 91 %
-    # do if the band is from 50 simulations.
+    # By this method, 95 % of further simulations lie in low..high; by NumPy's default method, only
+    # 91 % do if the band comes from 50 simulations.
     low, median, high = np.percentile(simulated, [_LOW, 50.0, _HIGH], method='weibull').tolist()
     return Band(measured, low, median, high)
 
