@@ -1,9 +1,9 @@
 """
 The voltage samples of a bag with their throttle and current.
 
-A msg config fits by name if the bag has its topic (or one ending with it, as in a namespace) with
-its type; a generic one also fits by type if only one topic has that type. If several fit, the user
-must choose. Limits: all samples of a bag are held in memory, 150 MB for an hour at 1 kHz.
+A msg config fits if a topic of its type has its name, or ends with it (in a namespace). A generic
+config also fits if exactly one topic has its type. If several configs fit, the user must choose.
+Limits: all samples of a bag are held in memory, 150 MB for an hour at 1 kHz.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def choose(
     path: Path, topics: Mapping[str, str], *, msg_config: str | Path | None = None,
     voltage_topic: str | None = None, throttle_topic: str | None = None,
 ) -> tuple[MsgConfig, dict[str, FieldSpec], tuple[str, ...]]:
-    """Return the config, its fields with the topics of this bag, by quantity, and notes."""
+    """Return the config, its fields by quantity with this bag's topics, and notes."""
     for topic in (voltage_topic, throttle_topic):
         if topic is not None and _absolute(topic) not in topics:
             raise InputError(f"{path}: no topic '{topic}': {nearest(_absolute(topic), topics)}")
@@ -136,7 +136,7 @@ def _throttle(
     spec = config.throttle
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
-        # Read a topic that the user names by the first of these specs that has its type.
+        # Read a topic that the user names with the first of these specs whose type matches.
         for one in (spec, *(c.throttle for c in list_msg_configs().values()),
                     FieldSpec(topic, FLOAT64, 'data')):
             if one is not None and one.type == topics[topic]:
@@ -201,7 +201,7 @@ def read_bag(
     written = columns[VOLTAGE]
     columns = {which: one.in_time_order() for which, one in columns.items()}
     if columns[VOLTAGE] is not written:
-        # The order of log times hides that the clock went back.
+        # Check the stamps as written: sorting by log time hides that the clock went back.
         part = (written.log_time >= first) & np.isfinite(written.stamp)
         if words := back_words(written.stamp[
                 part if last is None else part & (written.log_time < last)]):
@@ -253,8 +253,8 @@ def read_bag(
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
              ends: FloatArray, own: npt.NDArray[np.bool_], sample_rate: float | None,
              ) -> tuple[ThrottleHold, int]:
-    """Return throttle or current held over voltage blocks (ends in s), and a count of NaN."""
-    # Of the values before `first`, ns, where the part starts, only the last known one is needed.
+    """Return throttle or current held over voltage blocks (ends in s), and its count of NaN."""
+    # Before `first` (ns), the start of the part, only the last known value is needed.
     known = np.flatnonzero(np.isfinite(column.values[:column.place(first)]))
     _, column = column.split(int(known[-1]) if known.size else 0)
     usable, unknown = np.isfinite(column.stamp), 0

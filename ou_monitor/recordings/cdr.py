@@ -2,9 +2,9 @@
 Read fields of many CDR messages as arrays, by layouts that are learned from single messages.
 
 CDR has no fixed offsets, because the length of a text or a sequence shifts everything after it.
-But in a recording the same lengths recur. So a message is walked once, by the definition of its
-type, and its layout is used for all messages of the same size with the same length words. A
-message with a new layout is walked by itself; one that does not fit its type is refused.
+But in a recording the same lengths recur. So one message is walked field by field, and its layout
+is used for all messages of the same size that state the same lengths. A message with a new layout
+is walked by itself; one that does not fit its type is refused.
 
 Plain CDR version 1 (OMG DDS-XTypes 7.4.3): alignment is counted from after the 4-byte header.
 The fields come from the definition in a bag or from the message class.  Limits: a type with a
@@ -40,8 +40,8 @@ Rows = npt.NDArray[np.uint8]
 # Representation identifier and options.
 _HEADER = 4
 
-# Limits of a walk: number of steps beyond 4 per byte (few bytes may state 2^32 empty elements),
-# and depth.
+# Limits of a walk: steps beyond 4 per byte (few bytes may state 2^32 empty elements), and depth of
+# nested types.
 _FREE_STEPS, _MOST_DEPTH = 1000, 50
 # Maximum number of layouts kept for messages of one size, and of length words in a kept layout; a
 # topic with more has no recurring layout.
@@ -106,7 +106,7 @@ def value_path(spec: FieldSpec, definitions: Definitions) -> FieldPath:
 
 
 def stamp_paths(spec: FieldSpec, definitions: Definitions) -> tuple[FieldPath, ...]:
-    """Return the paths of a stamp: of seconds and nanoseconds, of one number, or none."""
+    """Return the paths of a stamp's seconds and nanoseconds, or of its number; (): no stamp."""
     if spec.stamp_field is None:
         return ()
     path, found = _find(spec, spec.stamp_field, definitions)
@@ -344,7 +344,7 @@ class FieldColumn(NamedTuple):
                 FieldColumn._make(column[k:] for column, k in zip(self, cut)))
 
     def place(self, log_time: int) -> int:
-        """Return the number of messages, which are in time order, before a log time, ns."""
+        """Return the number of messages before a log time, ns; they must be in time order."""
         return int(np.searchsorted(self.log_time, np.uint64(log_time), 'left'))
 
     def in_time_order(self) -> FieldColumn:
@@ -364,7 +364,7 @@ def joined_columns(parts: list[FieldColumn]) -> FieldColumn:
     parts.clear()
     for k, (_, *pieces) in enumerate(columns):
         if pieces and not any(piece.strides[0] for piece in pieces):
-            # All parts are views of one value, so the whole is one, too.
+            # All parts are views of one value: join them as a view of it.
             columns[k] = np.broadcast_to(pieces[0][0], sum(piece.size for piece in pieces))
         else:
             columns[k] = np.concatenate(columns[k])
@@ -378,7 +378,7 @@ def seconds(log_time: TimeArray) -> FloatArray:
 
 
 def _spread(begin: IntArray, count: IntArray) -> IntArray:
-    """Return begin[0], begin[0] + 1, ..., `count` of each, one after another."""
+    """Return begin[k], begin[k] + 1, ..., count[k] of them, for each k in turn."""
     ends = np.cumsum(count)
     places: IntArray = np.repeat(begin - (ends - count), count)
     return places + np.arange(places.size)
@@ -391,7 +391,7 @@ class ZeroRule:
         self._rule = rule
 
     def apply(self, values: FloatArray) -> FloatArray:
-        """Return values, in order of arrival, with such zeros as NaN."""
+        """Return values with such zeros as NaN; pass them in order of arrival."""
         if self._rule == 'value':
             return values
         nothing = values == 0.0
@@ -405,9 +405,9 @@ class ZeroRule:
 
 class FieldReader:
     """
-    Reads one field, and its stamp, of messages of one type.
+    Reads one field of messages of one type, and their stamps.
 
-    `beside` is a second field, of one number in each message. The `nan` rules are not applied: a
+    `beside` is a second field, with one number in each message. The `nan` rules are not applied: a
     missing or non-finite value is NaN. A message that does not fit its type is reported to
     `broken` and left out. Raises InputError if the type has no such field, or the field is not a
     number.
@@ -468,7 +468,7 @@ class FieldReader:
 
     def _groups(self, table: MessageTable, refused: dict[int, str],
                 ) -> Iterator[tuple[IntArray, Rows, Layout]]:
-        """Yield messages by layout (indices, rows, layout); note why others do not fit."""
+        """Yield messages by layout (indices, rows, layout); record why others are refused."""
         lengths = table.end - table.begin
         for length in np.unique(lengths).tolist():
             left = np.nonzero(lengths == length)[0]
@@ -512,10 +512,10 @@ class FieldReader:
 
     @staticmethod
     def _values(layout: Layout, rows: Rows, spec: FieldSpec, path: FieldPath) -> FloatArray:
-        """Return a field in SI units, shape (messages, values in each); NaN: not finite."""
+        """Return a field in SI units, shape (messages, values in each); NaN if not finite."""
         place = layout.places.get(path)
         if place is None:
-            # An element beyond its array: nothing in a block, else an unknown value.
+            # The element is beyond its array: no values for a block, NaN for a single number.
             return np.full((rows.shape[0], int(spec.sample_rate is None)), np.nan)
         block = place.column(rows).reshape(rows.shape[0], -1)
         if spec.sign * spec.unit_factor != 1.0:

@@ -2,7 +2,7 @@
 Index one .mcap file with the MCAP library: topics, places of their messages, and damage.
 
 The file is walked record by record.  Chunks that an intact summary lists are unpacked later, when
-their messages are read; all others, and all chunks with `partial`, are unpacked during the walk.
+their messages are read; all others (with `partial`, all chunks) are unpacked during the walk.
 Every stated size is compared with its limit before anything is read or unpacked.  The message
 indexes after a chunk are used only if they account for every byte of it.  Damage is reported by
 chunk.
@@ -50,8 +50,8 @@ _FOOTER = _HEAD.size + 20 + len(MAGIC)
 _DATA = _HEAD.size + _MESSAGE.size
 # First opcode that is private to a writer.
 _PRIVATE = 0x80
-# Records allowed before and after the end of the data: a wrong bit in an opcode must not turn a
-# record into one that is skipped.
+# Records allowed before the end of the data, and after it: a wrong bit in an opcode must not turn
+# a record into one that is skipped.
 _IN_DATA = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK,
             Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END,
             Opcode.FOOTER}
@@ -80,7 +80,7 @@ _BLOCK = 64 * 1024
 # Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
 # zeros.
 _MOST_RATIO = 256
-# Limit of a chunk: its minimum, bytes; its maximum is the memory divided by the second number.
+# Limit of an unpacked chunk, bytes: at least the first number, at most memory / the second.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 
 
@@ -134,7 +134,7 @@ def _over_limit(what: str, length: int, limit: int) -> str:
 
 
 def moment(log_time_ns: int, origin_ns: int) -> str:
-    """Return a log time in words, also counted from the start of the recording."""
+    """Return a log time in words: since the start of the recording, and as logged."""
     return (f'{(log_time_ns - origin_ns) / 1e9:.3f} s into the recording, log time '
             f'{log_time_ns // 10**9}.{log_time_ns % 10**9:09d} s')
 
@@ -518,7 +518,7 @@ class McapFile:
         try:
             data = self._data(file, span)
             file.seek(span.offset + span.length)
-            # Longest index: 15 bytes per channel and 16 per message (of 31 bytes or more).
+            # Longest index: 15 bytes per channel and 16 per message (each has 31 bytes or more).
             index = file.read(min(span.index_length, len(data) + 15 * 65536))
             table = self._messages(data, index)
             if span.unpacked and ((table.log_time < span.start_ns)
@@ -604,7 +604,7 @@ def _crc(file: BinaryIO, length: int) -> int:
 
 def _decompressed(compression: str, data: bytes, stated: int,
                   zstd: zstandard.ZstdDecompressor) -> bytes:
-    """Return the content of a chunk, in at most the memory that it states."""
+    """Return the content of a chunk, unpacked to at most its stated size."""
     if compression == 'zstd':
         size = zstandard.frame_content_size(data)
         if size not in (-1, stated):

@@ -4,7 +4,7 @@ Model files: the terms of a supply as YAML.
 `model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the first being `ou`;
 `load:` (optional) holds start values of the load filter; `full_load_a:` (optional) is the current
 at which the load is 1, A, if the load is a current; `provenance:` is free text. `discover` and
-`simulate` write it; `simulate`, `compare` and the nodes read it.
+`simulate` write model files; `simulate`, `compare` and the nodes read them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class ModelFile:
 
 @one_line()
 def read_model(path: str | Path) -> ModelFile:
-    """Read a model file; the largest, 1 MB, takes 2 to 5 s, so a node reads it in a thread."""
+    """Read a model file; 1 MB, the maximum, takes 2 to 5 s, so nodes read it in a thread."""
     return parse_model(read_yaml(path, 'the model file'), path_words(path))
 
 

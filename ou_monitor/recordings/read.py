@@ -2,8 +2,8 @@
 Read any recording (bag, CSV or autopilot log) as a `Recording`, and any scalar beside it.
 
 Limits: stamps of a bag are float64 seconds of its own clock, with a resolution of 0.24 us for a
-clock from 1970.  A signal has the stamps of its messages' headers, or otherwise log times of the
-bag; if the voltage has the other kind of stamps, the signal is shifted by the transmission delay.
+clock from 1970.  A signal has the stamps of its messages' headers or, without headers, log times
+of the bag; if the voltage has the other kind, the signal is shifted by the transmission delay.
 """
 
 from __future__ import annotations

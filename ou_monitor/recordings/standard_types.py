@@ -202,7 +202,7 @@ def encode_joints(stamps_ns: npt.NDArray[np.int64], names: Sequence[str],
 
 
 def encode_blocks(samples: npt.NDArray[np.float64]) -> list[bytes]:
-    """Return std_msgs/Float32MultiArrays with one dimension named 'samples', shape (m, n)."""
+    """Return a std_msgs/Float32MultiArray for each row of samples, shape (m, n)."""
     n = samples.shape[1]
     return _encode(FLOAT32_ARRAY, {'data': samples}, data=[0.0] * n, layout={
         'dim': [{'label': 'samples', 'size': n, 'stride': n}]})

@@ -47,7 +47,7 @@ _BASEFLIGHT = 1e-3
 
 Fields = dict[str, FloatArray]
 Headers = dict[str, Any]
-# Field without its index -> SI per unit, unit, words.
+# Field without its index -> factor to SI, SI unit, description.
 Units = dict[str, tuple[float, str, str]]
 
 _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\.?(\d*)', re.I)
@@ -56,7 +56,7 @@ _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\
 def read(path: Path, request: Request) -> Log:
     """Read one flight of a blackbox file, by default the largest."""
     pointers = Reader(str(path), None, True).log_pointers
-    # Bytes of each flight, without decoding them.
+    # Size of each flight in bytes, found without decoding it.
     held = np.diff([*pointers, path.stat().st_size]).tolist()
     wanted = request.flight or (held.index(max(held)) + 1 if held else 1)
     notes = []
@@ -123,7 +123,7 @@ def _wanted(names: list[str], request: Request) -> list[str]:
 
 
 def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArray, int]:
-    """Return the wanted fields of sound frames, shape (n, fields), and the number of others."""
+    """Return the wanted fields of sound frames, shape (n, fields), and the number dropped."""
     pick = itemgetter(*places) if len(places) > 1 else (lambda data: (data[places[0]],))
     reader, context = parser.reader, parser._ctx
     rows: list[tuple[int, ...]] = []
@@ -185,13 +185,13 @@ def _facts(headers: Headers) -> dict[str, str]:
 
 
 def _cells(headers: Headers) -> dict[str, str]:
-    """Return the number of cells, counted as in the firmware, and their lowest voltage, V."""
+    """Return the number of cells, counted as in the firmware, and a cell's lowest voltage, V."""
     words = [re.findall(r'\d+', str(headers.get(key, '')))
              for key in ('vbatcellvoltage', 'vbatref')]
     if len(words[0]) != 3 or len(words[1]) != 1:
         return {}
     low, _, high = (float(word) for word in words[0])
-    # 0.01 V from Betaflight 4.0 on, 0.1 V before; INAV has cells in 0.1 V and the pack in 0.01 V.
+    # Unit: 0.01 V from Betaflight 4.0 on, 0.1 V before; INAV: 0.1 V for cells, 0.01 V for packs.
     fine = high > 100.0
     reference = float(words[1][0]) * (0.01 if fine or float(words[1][0]) >= 300.0 else 0.1)
     low, high = (value * (0.01 if fine else 0.1) for value in (low, high))
@@ -280,7 +280,7 @@ def _signed(value: FloatArray) -> FloatArray:
 
 
 def _pair(value: Any) -> tuple[float, float] | None:
-    """Return a value as two rising numbers, or None if it is not that."""
+    """Return a list of two rising numbers as a pair; None for any other value."""
     if isinstance(value, list) and len(value) == 2 and all(
             isinstance(x, (int, float)) for x in value) and value[1] > value[0]:
         return float(value[0]), float(value[1])

@@ -23,7 +23,7 @@ from ou_monitor.records import Defect, FloatArray, Note, prefixed
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline import check_throttle
 
-# Word that leaves a quantity out.
+# Name by which the user leaves a quantity out.
 NONE = 'none'
 
 # Maximum number of series named in one line, and the hint where to find the others.
@@ -62,8 +62,8 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     notes: list[str] = []
     if second is None and current is None and (
             held := [one for one in _series_of(log, CURRENT) if not one.silent]):
-        notes.append('No current clearly belongs to this voltage: ' + _names_of(held)
-                     + f'; none is used ({option.format(CURRENT)} NAME names one).')
+        notes.append('No current clearly belongs to this voltage, so none is used; found: '
+                     + _names_of(held) + f' ({option.format(CURRENT)} NAME names one).')
     usable: dict[str, Series] = {}
     dropped: dict[str, list[str]] = {}
     for one in (volts, first, second):
@@ -193,7 +193,7 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
 # Number of parts of a series whose rates are compared; ratio of rates above which a note is given.
 _PARTS, _UNEQUAL = 10, 1.5
-# Minimum length of a gap, in typical steps.
+# Minimum length of a gap, in median steps.
 _GAP = 3.0
 
 

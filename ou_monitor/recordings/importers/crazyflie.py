@@ -145,7 +145,7 @@ def _places(data: bytes, begin: int, end: int, events: dict[int, _Event],
 
 def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
     """Yield each variable in SI, and the mean of the motors."""
-    # Values of an event are not candidates for the battery: they have no steady rate.
+    # Variables of other events are never the default: they have no steady rate.
     ranked = not prefix
     motors = [f'motor.m{k}' for k in range(1, 5)]
     if all(name in columns for name in motors):

@@ -28,7 +28,7 @@ _LONGEST = 40
 
 
 def _by_word(**units: str) -> dict[str, str]:
-    """Return a table from words for units, in lower case, to the unit."""
+    """Return a map from each word for a unit, in lower case, to the unit."""
     return {word: unit for unit, words in units.items() for word in words.split()}
 
 

@@ -39,19 +39,18 @@ from ou_monitor.stream.files import opened
 
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
-# Added to the error about a cell with a decimal comma, and to errors of single lines.
+# Endings of errors: about a cell with a decimal comma; about a single bad line.
 _MARK = ': the decimal mark is a point (with --decimal . a comma separates thousands)'
 _PARTIAL = '; --partial leaves bad lines out'
-# Maximum characters of a line: a log of 1000 columns has lines of some 10 000.
+# Maximum characters of a line: a log of 1000 columns has lines of about 10 000.
 MOST_OF_LINE = 65536
-# Bytes, and lines, in which the format is detected; characters, and rows, read at once.
+# Bytes and lines in which the format is detected; characters and rows that are read at once.
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 # A byte that does not occur in text.
 _DAMAGE = re.compile(rb'[^\t\n\r\f -\xff]')
 # Consecutive rows of numbers that mark the beginning of the data.
 _IN_A_ROW = 8
-# Minimum leap of the first column, in its usual steps, from a row that numbers the columns to the
-# data.
+# Minimum leap of the first column after a row of column numbers, as a multiple of later steps.
 _LEAP = 10.0
 
 # Columns of `ros2 topic echo --csv` of a sensor_msgs/BatteryState, up to its cells.
@@ -404,7 +403,7 @@ def _names_in_rows(rows: list[list[str]], width: int) -> list[str]:
     numbered = [f'column {k + 1}' for k in range(width)]
     if rows and all(map(_is_battery_state, rows)):
         return _BATTERY_STATE + numbered[len(_BATTERY_STATE):]
-    # MAVLink dumps name each number in the cell to its left; a single name may be a frame's.
+    # MAVLink dumps name each number in the cell to its left; a single such name may be a frame's.
     before = [{row[k] if is_number(row[k + 1]) else '' for row in rows}
               for k in range(min(map(len, rows), default=0) - 1)]
     named = {k + 1: name for k, words in enumerate(before) if len(words) == 1 and re.fullmatch(
@@ -431,7 +430,7 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
         return len(named) == len(needed) and not any(map(is_value, named))
 
     if above and not names_all(above[-1][1]):
-        # A line of sources may follow the line of units.
+        # A line with the source of each column may follow the line of units.
         above = next((above[:k + 1] for k in range(len(above) - 1, 0, -1) if _are_units(
             above[k][1]) and names_all(above[k - 1][1])), above)
     # A fact with a decimal number is not a line of names.
@@ -480,8 +479,8 @@ def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: 
 
 def _unit_above(names: list[str], k: int, begin: int, above: list[list[str]]) -> str:
     """Return the unit of volts or amperes of a column in the lines above; '' if none states it."""
-    # At the end of the channel's own line, such as 'CH2,DC,50mV,A', or in a line such as
-    # 'Vertical Units,V,CH2:A': below the channel's name, or in the order of the columns.
+    # The unit is at the end of the channel's own line ('CH2,DC,50mV,A'), or in a line of units
+    # ('Vertical Units,V,CH2:A'), below the channel's name or in the order of the columns.
     if k < begin:
         return ''
     place = k + 1 - begin
@@ -565,7 +564,7 @@ def numbers(path: Path, form: Form, places: Sequence[int],
             left_out: list[str] | None = None, only: tuple[int, frozenset[str]] | None = None,
             ) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
-    # only: a column, and the words in it whose rows hold numbers; text in other rows becomes NaN,
+    # only: a column, and its words that mark rows with numbers; text in other rows becomes NaN,
     # and the next column is not read for units.
     # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
     parts: list[list[FloatArray]] = [[] for _ in places]
@@ -610,7 +609,7 @@ def numbers(path: Path, form: Form, places: Sequence[int],
 
 
 def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int], str]) -> None:
-    """Raise InputError if a bad line is another header: another table begins."""
+    """Raise InputError if a bad line is a header that begins another table."""
     cells = [cell.strip() for cell in row]
     others = [k for k, (cell, name) in enumerate(zip(cells, names)) if cell != name]
     if others and not any(map(is_value, cells)) and (
@@ -700,7 +699,7 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
 def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stated: str,
             good: npt.NDArray[np.bool_] | None, left_out: list[str] | None) -> FloatArray:
     """Return cells as numbers (where: states the place of a cell; stated: their unit)."""
-    # A bad cell raises InputError, or with `good` marks its line there and appends the error once.
+    # A bad cell raises InputError; with `good`, its line is marked as bad, and one error appended.
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
         # As in `plain_number`.

@@ -45,7 +45,7 @@ MOST_COLUMNS = 300
 _BACK = 0.25
 # Maximum number of series whose names are whole numbers: MAVLink has up to nine batteries.
 _MOST_SERIES = 9
-# Minimum number of rows for conclusions from comparing rows, such as repeated stamps.
+# Minimum number of rows to compare, for example to detect repeated stamps.
 _FEW_ROWS = 8
 
 
@@ -236,7 +236,7 @@ def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
 
 def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
            needed: str = ' (--voltage-column)', left_out: list[str] | None = None) -> _Table:
-    """Read time, the columns of a supply, and others by name (needed: how to name a voltage)."""
+    """Read time, supply and named columns (needed: hint if no voltage is found; '': optional)."""
     raw = form = form_of(path, wanted)
     time = clock = _time_of(path, form, wanted)
     if series := _series_of(path, form, wanted, time):
@@ -502,14 +502,14 @@ def _nameless_columns(form: Form) -> list[int]:
 
 
 def _range_of(form: Form, place: int) -> float:
-    """Return the range of a column in the first rows relative to its mean; inf if below 1."""
+    """Return the range of a column's first cells relative to their mean; inf if one is below 1."""
     # A load changes a supply's voltage by a few percent, and its current by far more.
     found = np.array([number_of(cell)[0] for cell in form.cells(place) if is_number(cell)])
     return float(np.ptp(found) / found.mean()) if found.size and found.min() >= 1.0 else math.inf
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
-    """Return a sole column; without a header, all that vary, if the first varies least."""
+    """Return a single place, or, without a header, those that vary if the first varies least."""
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
         return places if len(places) == 1 else []
     # Constant columns are not compared.
@@ -568,7 +568,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
         places = _choose(form, quantity, taken)
         guess = not places or CHANNEL.fullmatch(unit_of(form.names[places[0]])[0]) is not None
         if not places and quantity == logs.VOLTAGE:
-            # Another option may name the column of the voltage; that is refused below.
+            # If another option names the voltage's column, the check below reports it.
             places = [k for k in _choose(form, quantity) if k in given]
         if quantity == logs.VOLTAGE:
             # Prefer a voltage that has a current of the same name.
@@ -663,8 +663,8 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
     """Raise InputError if an unused column shows that `values` holds several series."""
     # Stamps rise within each series.  Several series are likely if stamps go back or repeat, if
     # the column of values has a general name, or if the series alternate and have ids or differ
-    # in level.  Levels of a random load alternate too, in up to 2/3 of the rows, so levels count
-    # only if they alternate in more than 3/4.
+    # in level.  A random load alternates in up to 2/3 of the rows, so levels count only if they
+    # alternate in more than 3/4.
     known = np.isfinite(t) & np.isfinite(values)
     stamps, levels = t[known], values[known]
     overlap = np.count_nonzero(

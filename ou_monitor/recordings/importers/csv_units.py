@@ -36,10 +36,10 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Number of values of a 32-bit counter; seconds per day.
 _COUNTS, _DAY = 2.0**32, 86400.0
-# No craft's pack has more V: without a unit, larger values are mV, and whole numbers above a tenth
-# of it are counts.
+# Maximum voltage of a pack, V. Without a unit, larger values are mV; whole numbers down to a tenth
+# of it may be ADC counts, and are refused.
 _MOST_VOLTS = 1000.0
-# A throttle without a unit is percent only above this maximum: a lever's voltage reaches 5 V.
+# Peak above which a throttle without a unit is percent, not a lever's voltage of up to 5 V.
 _LEAST_PERCENT = 5.5
 
 
@@ -49,9 +49,9 @@ class FileColumn(NamedTuple):
     place: tuple[int, ...]  # Its columns: two for a date and a time, none if rows are counted
     name: str
     unit: str  # As stated or given, '' if neither
-    scale: float  # Factor by the maker's definition; 0: by the unit
+    scale: float  # Factor that the maker defines; 0: the unit decides
     unknown: float = math.nan  # Number that stands for "unknown"
-    guess: bool = False  # Whether the name does not tell the quantity
+    guess: bool = False  # Whether the quantity is guessed
 
 
 def unwrapped(t: FloatArray) -> FloatArray:
@@ -59,21 +59,21 @@ def unwrapped(t: FloatArray) -> FloatArray:
     known = np.isfinite(t)
     if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all():
         on = np.unwrap(t[known], period=_COUNTS)
-        # A restart of the logger is not a wrap: unwrapped, it would leave an unusually long step.
+        # A restart of the logger is not a wrap: unwrapped, it would become an unusually long step.
         if (np.diff(on) <= 2.0 * np.diff(t[known]).max(initial=0.0)).all():
             t[known] = on
     return t
 
 
 def _of_day(t: FloatArray) -> FloatArray | None:
-    """Return times written as the numbers HHMMSS.ss in s; None if they are not written so."""
+    """Convert times written as numbers HHMMSS.ss to s; None if they are not of this form."""
     minutes, second = np.divmod(t, 100.0)
     hour, minute = np.divmod(minutes, 100.0)
     if (t < 0.0).any() or (second >= 60.0).any() or (minute >= 60.0).any() or (hour >= 24.0).any():
         return None
     seconds = 3600.0 * hour + 60.0 * minute + second
     seconds += _DAY * np.append(0.0, np.cumsum(np.diff(seconds) < -0.5 * _DAY))[:t.size]
-    # The numbers leap by 40 at each full minute, where the time goes on evenly.
+    # At each full minute the numbers leap by 40, but the time must go on evenly.
     steps, full = np.diff(seconds), np.diff(minutes) != 0.0
     within, over = steps[~full & (steps != 0.0)], steps[full]
     if not over.size or over.size > within.size:

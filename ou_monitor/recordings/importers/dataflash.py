@@ -144,7 +144,7 @@ def _close(log: Any) -> None:
 
 
 def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
-    """Return the wanted fields of all messages, the log's texts, and the count of bad ones."""
+    """Return the wanted fields of all messages, the log's texts, and the count of bad messages."""
     fields: dict[str, list[str]] = {kind: [*RATES, *FORCES] for kind in GYROS}
     for kind, field, *_ in (*PLAIN, SPEED):
         fields.setdefault(kind, []).append(field)
@@ -323,7 +323,7 @@ def _speeds(table: Table) -> Series | None:
 
 
 def _throttle_scale(values: FloatArray) -> float:
-    """Return the factor to 0..1: from a share, percent (Plane), or thousandths (before 2016)."""
+    """Return the factor to 0..1: from 0..1, percent (Plane), or thousandths (before 2016)."""
     finite = np.abs(values[np.isfinite(values)])
     highest = float(finite.max()) if finite.size else 0.0
     return 1.0 if highest <= 1.5 else 0.01 if highest <= 110.0 else 0.001

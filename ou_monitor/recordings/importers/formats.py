@@ -50,14 +50,14 @@ def is_text(head: bytes) -> bool:
     if mark or head[1:2] == b'\0' != head[:1] and head[3:4] == b'\0':
         # "Unicode text" of spreadsheets, whose cells use only the first 256 characters.
         head = head[2 * mark:].replace(b'\0', b'')
-    # Text that is not UTF-8 and damaged cells pass, so that the reader can name their line.
+    # Damaged cells, and text that is not UTF-8, pass: the reader can then name their line.
     return bool(head) and (head[0] < 0x80 or b'\n' in head) and head.count(
         b'\0') <= _NULS * len(head) and all(
             byte >= 0x20 or byte in b'\0\t\n\r\f' for byte in head)
 
 
 def _is_crazyflie(head: bytes) -> bool:
-    # 0xBC, version 1 or 2, and the number of events, at most 20 in the firmware.
+    # 0xBC, version 1 or 2, and the number of events: at most 20 in the firmware, 255 here.
     return len(head) > 5 and head[0] == 0xBC and head[1:3] in (b'\1\0', b'\2\0') and (
         0 < int.from_bytes(head[3:5], 'little') <= 255)
 
@@ -144,7 +144,7 @@ _OF_BAGS = ('.mcap', '.db3', '.bag', '.yaml', '.yml')
 def kind_of(path: Path) -> str:
     """Return the name of the format in which a recording is read: CSV, a log's, or BAG."""
     found, ending = None, path.suffix.lower()
-    # The reader reports why it cannot be read.
+    # If the file cannot be read, the reader reports why.
     with suppress(InputError):
         found = detect(path) if path.is_file() else None
     if found is None:

@@ -209,7 +209,7 @@ def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
 
 
 def near(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which stamps are in a large group without a pause of an hour; all if none is."""
+    """Return which stamps are in a large group with no pause of an hour; all if none is large."""
     order = np.argsort(t, kind='stable')
     good = np.ones(t.size, dtype=bool)
     pauses = np.flatnonzero(np.diff(t[order]) > _FAR) + 1

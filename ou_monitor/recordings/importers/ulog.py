@@ -236,7 +236,7 @@ def _started(ulog: Any) -> dict[str, str]:
 
 def _series(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     connected = columns.get('connected')
-    # A battery that was never connected is listed last.
+    # A battery that was never connected is used only if the user names it.
     there = connected is None or bool(np.any(connected))
     for source, field, quantity, rank, words in PLAIN:
         if source != topic or field not in columns:
