@@ -79,13 +79,13 @@ def answer(analysis: Analysis) -> list[str]:
 
 
 def _low_limit(analysis: Analysis) -> list[str]:
-    """Return a warning if the limit is too low for the pack, as one per cell would be."""
+    """Return a warning if the limit is too low for the pack: it may be meant per cell."""
     limit, craft = analysis.by_throttle.voltage, analysis.craft
     if not (craft.measures and limit < LOWEST_CELL * craft.cells) or analysis.brownout_default:
         return []
     return [f'Check the limit: {limit:g} V is {number(limit / craft.cells, 2)} V per cell if this '
-            f'is a pack of {counted(craft.cells, "cell")}. A limit per cell needs '
-            f'--cells {craft.cells} too.']
+            f'is a pack of {counted(craft.cells, "cell")}. For a limit per cell, '
+            f'add --cells {craft.cells}.']
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
@@ -255,7 +255,7 @@ def _caution(item: QualityItem) -> str:
 
 
 def _by_throttle(analysis: Analysis) -> Part:
-    """Return the table of sag, noise and risk at the throttles of `supply`."""
+    """Return the table of sag, noise and risk over throttle."""
     curves, sag, noise = (analysis.by_throttle, analysis.overview.facts.sag,
                           analysis.overview.facts.noise)
     if math.isnan(noise.flown[0]):
@@ -412,8 +412,8 @@ def _process(analysis: Analysis) -> list[Part]:
         lambda: [Table(['throttle', *_TESTS.values()], rows, left=[0]), Text(
             'p-values, Holm-adjusted over all tests of all levels; below each, the effect size. '
             '* marks a rejection: p below 0.01 and an effect large enough to matter. Every supply '
-            'that relaxes is "correlated"; of recordings with stationary OU levels, one in a '
-            'hundred has a rejection in any other column.')],
+            'that relaxes is "correlated"; in the other columns, one in a hundred recordings with '
+            'stationary OU levels has a rejection.')],
         Notes.of(reasons)]
 
 

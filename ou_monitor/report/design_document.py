@@ -19,7 +19,7 @@ _LEAST_RISK = 1e-9
 
 
 def design_document(result: Design, source: str, taken: str = '') -> Document:
-    """Return the report of a design (source: of the limit; taken: describes a flight's values)."""
+    """Return the report of a design (source: of the limit; taken: what a flight gave, as text)."""
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
@@ -47,7 +47,7 @@ def design_document(result: Design, source: str, taken: str = '') -> Document:
                'mean time', 'risk (OU)', 'risk (rate)', ''], cells, left=[9]),
         Text('Mean time: from the mean to the first brown-out. Risk (OU): from the exact first '
              'passage of the OU; risk (rate): from the rate at which the whole noise crosses the '
-             'level. The larger one counts.', legend=True),
+             'level. The larger risk counts.', legend=True),
         Table(['what', 'unit', 'present', 'tried', 'risk then', f'needed for {result.target:g}'],
               [[lever.name, lever.unit, lever.words(lever.present), lever.words(lever.tried),
                 probability(lever.risk), 'none' if lever.least == lever.present else

@@ -124,7 +124,7 @@ def _gain(finding: Finding, seen: Overview | None) -> list[Part]:
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
                   [row[:kept] for row in rows], left=[0]), Text(
                       '' if finding.refused else _under_load(finding)),
-            Text('The plain OU, which includes level and load, has '
+            Text('The plain OU, whose noise includes changes of level and load, has '
                  f'{parameters(baseline, {})}.' + (
                      f' The extended model has {parameters(ou, finding.se[0])}.'
                      f'{_disagreement(finding, seen)}' if finding.causes else ''))]
@@ -159,7 +159,7 @@ def _disagreement(finding: Finding, seen: Overview | None) -> str:
             f'from the last {number(supply.window_s)} s): ' + (
                 f'that value also contains {" and ".join(inside)}, which the model separates.'
                 if inside else
-                'the model also fits errors of its response to load: trust the value there.'
+                'the model also fits errors of its response to load; trust that value.'
                 if finding.remaining else
                 'no statistic contradicts the model, so the relaxation seems to change.'))
 

@@ -340,7 +340,7 @@ def comparison_words(fleet: Fleet) -> list[str]:
     if len(fleet.vehicles) < LEAST_VEHICLES:
         notes.append(
             'Vehicles: the mean resistance and sag of each are compared with the mean of the '
-            'others with the same number of cells, by the scatter between flights; below '
+            'others with the same number of cells, relative to the scatter between flights. Below '
             f'{LEAST_VEHICLES} vehicles the spread between good ones is unknown, so only a '
             'difference above 10 % counts.'
             if compared else 'Vehicles are not compared with each other: that needs two with the '
@@ -575,7 +575,7 @@ def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
 
 def _dots(plot: Plot, names: Sequence[str], vehicles: Sequence[str], flights: FloatArray,
           y: FloatArray, marked: npt.NDArray[np.bool_], words: tuple[str, str]) -> None:
-    """Draw a dot for each recording above its vehicle, in the order of their flights."""
+    """Draw a dot for each recording above its vehicle, in the order of flights."""
     plot.places(list(short_names(names).values()))
     x = np.array([names.index(v) + 1.0 if v else np.nan for v in vehicles])
     for place in np.unique(x[np.isfinite(x)]):

@@ -126,7 +126,7 @@ def _axis(label: str, ends: tuple[float, float], log: bool) -> dict[str, Any]:
 
 
 def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append x to the block, a long non-decreasing column as second differences on a grid."""
+    """Append x to the block; a long rising column becomes second differences on a grid."""
     if x.size > _EXACT and not log and np.isfinite(x).all():
         step = np.diff(x)
         by = float(np.median(step)) / _GRID
@@ -138,7 +138,7 @@ def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
 
 
 def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append y to the block, a long column as float32, less its median if that saves digits."""
+    """Append y to the block; a long column becomes float32, less its median if that helps."""
     finite = y[np.isfinite(y)]
     if y.size > _EXACT and finite.size:
         middle, size = float(np.median(finite)), np.abs(finite[finite != 0.0])

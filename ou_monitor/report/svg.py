@@ -1,9 +1,9 @@
 """
 Plots as inline SVG, without a plotting library.
 
-`page.embed` puts the data beside the drawing, and the script of the page makes it interactive;
-print and browsers without scripts show this drawing.  Colours are CSS classes (``s0`` .. ``s7``
-for series); `page.css` gives their colours for light and dark mode.
+`page.embed` puts the data beside the drawing, from which the script of the page makes an
+interactive plot; on paper, and without scripts, the drawing stays.  Colours are CSS classes
+(``s0`` .. ``s7`` for series), defined in `page.css` for light and dark mode.
 """
 
 from __future__ import annotations
@@ -277,8 +277,8 @@ class Plot:
         for where, label in sorted(self.marks):
             pixel = float(x(where))
             if _LEFT <= pixel <= right:
-                # Near the right edge, put the label left of its line; below earlier labels that it
-                # would cover.
+                # Put the label left of its line near the right edge, and below earlier labels that
+                # it would cover.
                 width = _LETTER * len(label)
                 start = pixel + 4.0 if pixel + 4.0 + width <= right else pixel - 4.0 - width
                 row = next((k for k, end in enumerate(ends) if end <= start), len(ends))

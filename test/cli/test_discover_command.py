@@ -58,7 +58,7 @@ def test_one_run_writes_summary_model_and_page(flight, tmp_path, capsys):
     out = capsys.readouterr().out
     assert all(len(line) <= 100 for line in out.replace(str(tmp_path), '').splitlines())
     for part in ('A plain simulation lacks sag (load_sag)', 'gain, mnat/sample', 'dips below',
-                 'The plain OU, which includes level', str(model), str(page)):
+                 'The plain OU, whose noise', str(model), str(page)):
         assert part in out
     file = read_model(model)
     found = strict(data.read_text())
