@@ -438,7 +438,7 @@ class OuFacts:
     """
     The fitted relaxation (an OU process plus white noise), or bounds on it.
 
-    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the drift of the level,
+    `not_visible`: a relaxation slower than `tau_below_s` (but faster than the drift of the level)
     has a variance below `var_inf_below` (95 %); a faster one may be all of the noise.
     """
 

@@ -182,7 +182,7 @@ def read_throttle(text: str, start: float | None = None, end: float | None = Non
 
 
 def recorded_throttle(recording: Recording, name: str, full: float = 0.0) -> RecordedThrottle:
-    """Return the throttle of a recording, or its current over full, A (name: for errors)."""
+    """Return a recording's throttle, or its current divided by `full`, A (name: for errors)."""
     duration = float(recording.t[-1] - recording.t[0])
     if full:
         if recording.current is None or not np.isfinite(recording.current).any():

@@ -370,7 +370,7 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     return part_of(recording, ~gone, (
         f'{counted(count)} left out: the supply was off {times} '
         f'(near {float(np.median(v[off])):.2g} V), from {float(t[begins[0]] - t[0]):.4g} s on, '
-        f'{seconds:.3g} s in all. Lowest voltage and dips include that, except at the ends of the '
+        f'{seconds:.3g} s in all. Lowest voltage and dips include them, except at the ends of the '
         'recording.'))
 
 
@@ -439,7 +439,7 @@ def ordered(recording: Recording) -> Recording:
 OFF, _ON = 0.2, 0.7
 # Maximum reading, as a multiple of the usual voltage (6S after 5 V of USB: 5).
 WILD_FACTOR = 20.0
-# Maximum number of outages, or this share of the samples if it is more; the share is also the
+# Maximum number of outages, or this share of the samples if that is more; the share is also the
 # maximum share of wild readings. Maximum share of samples off; maximum ratio of samples between
 # the two limits to samples below the lower one.
 _OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0
@@ -467,8 +467,8 @@ TAIL, _ENOUGH, _LOOK = 1024, 64, 256
 _STRETCH = 20
 # Indices of samples, or a slice if all are meant.
 Picked = npt.NDArray[np.intp] | slice
-# Repeats are searched if more than this share of the samples is equal to the previous sample.  If
-# there are repeats, the share is at least a third.
+# Search for repeats if more than this share of the samples is equal to the previous one.  With
+# repeats, the share is at least a third.
 _TIED = 0.25
 
 

@@ -71,7 +71,7 @@ class MsgConfig:
     # Where the current drawn is, A, in the messages of the voltage.
     current: FieldSpec | None = None
     # Where the speeds of the motors are, 1/min of the shaft unless `notch.rpm_unit` says
-    # otherwise; the field may be an array, or name each element of one, 'esc[].esc_rpm'.
+    # otherwise; the field may be an array, or a field of each element, 'esc[].esc_rpm'.
     rpm: FieldSpec | None = None
 
 

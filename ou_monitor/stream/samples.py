@@ -7,7 +7,7 @@ numbers of their messages; two with equal numbers and times cannot be distinguis
 Throttle: one rule for the node and offline.  A throttle holds from its own stamp on if its clock
 is the same as the voltage's, otherwise from the next voltage message on.  The clocks are compared
 at each throttle message, with the newest voltage stamp received by then.  A throttle has no
-maximum age; the caller knows the present time and decides when it is too old.  Samples handed to
+maximum age: the caller, who knows the present time, decides when it is too old.  Samples handed to
 the monitor are final: a throttle that arrives later applies to later samples only.
 
 Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, which bus and
@@ -43,7 +43,7 @@ MOST_DELAY = 600.0
 GIVE_UP = 1.0
 # Minimum silence, in message intervals, that may be a pause of the publisher rather than a loss.
 PAUSE = 10.0
-# Maximum number of tracks, beyond the number of publishers, within a batch.
+# Maximum number of tracks within a batch, in excess of the number of publishers.
 _MORE = 4
 # Weight of a new interval in the mean interval of a publisher.
 _LEARN = 0.05
@@ -179,8 +179,8 @@ BoolArray = npt.NDArray[np.bool_]
 # spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm leaves a lag of 1 ms.
 FOLLOW = 10.0
 
-# A stamp that differs from the time line by more than this and two blocks reveals a gap; a busy
-# companion computer delays blocks by about 100 ms and then sends them all.
+# A stamp that differs from the time line by more than this, and by more than two blocks, reveals a
+# gap; a busy companion computer delays blocks by about 100 ms and then sends them all.
 GAP_LEAST = 0.25  # s
 
 
@@ -247,7 +247,7 @@ def clock_of(spec: FieldSpec) -> BlockClock | None:
 # Difference of voltage and throttle stamps, s, above which they are from different clocks (an
 # autopilot's boot time and a wall clock differ by years).
 APART = 5.0
-# The same, s, if only one of the two has its own stamp and the other its time of sending or
+# The same limit, s, if one of the two has its own stamp, and the other only its time of sending or
 # logging: transmission takes milliseconds, and unsynchronized clocks may differ by little.
 APART_MIXED = 0.25
 # Tolerance between the stamps of a sample and of a throttle, as a share of a step: stamps within a
