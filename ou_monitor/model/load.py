@@ -1,8 +1,8 @@
 """
 The voltage of a battery under load, from throttle or current; start values for the next flight.
 
-Limits: the form and its constants were chosen on nine recordings (doc/load.md).  Charge is
-computed from the load; if only throttle is known, wind and payload cause errors.
+Limits: the form and its constants were chosen on nine recordings (doc/load.md).  All motors count
+as alike.  Charge is computed from the load; from throttle alone, wind and payload cause errors.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
 x = ul^p (E/3.8)^(p-1) exp(-k h), ul = LP(u, lag), dq = x dt / (mean x T),

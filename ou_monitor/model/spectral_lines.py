@@ -14,12 +14,12 @@ frequency (from a crystal oscillator) is clearest.
 Each line is subtracted as a sinusoid with its own amplitude, phase and frequency in each piece of
 the length in which the line was found; this also removes a little noise.
 
-Limits: the noise is treated as constant over the neighbours (about 60 bins on either side).  A
-line must also exceed the nearest eight ordinates on either side, so that a slope or a wide hump of
-the noise does not count as a line; a narrower resonance does.  Samples are treated as
-evenly spaced; a line may be an alias; frequencies below `FIRST` periods per piece are not
-searched.  A line whose frequency changes is spread over bins, and may be missed.  If a tone moves
-by more than a bin within a piece, or is modulated, its sidebands remain.
+Limits: the noise is treated as constant over the neighbours (about 60 bins on either side, up to
+260 in long pieces).  A line must also exceed the nearest eight ordinates on either side, so that a
+slope or a wide hump of the noise does not count as a line; a narrower resonance does.  Samples are
+treated as evenly spaced; a line may be an alias; frequencies below `FIRST` periods per piece are
+not searched.  A line whose frequency changes is spread over bins, and may be missed.  If a tone
+moves by more than a bin within a piece, or is modulated, its sidebands remain after subtraction.
 """
 
 from __future__ import annotations

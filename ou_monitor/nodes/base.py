@@ -42,8 +42,8 @@ LOCK = Parameter(
     'lock_parameters', False,
     'Whether to refuse what can disarm the node at run time: changes of any parameter except '
     'publish_rate, and the services ~/clear_brownout and ~/save_model.')
-# Busy wait at the end of a sleep, s: the usual lateness of `sleep`.  For a 1 kHz bag, it takes a
-# tenth of a core.
+# Busy wait at the end of a sleep, s: the usual lateness of `sleep`.  For a 1 kHz bag, the busy
+# wait takes a tenth of a core.
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05
@@ -248,7 +248,7 @@ class MonitorNode(Node):
         return self._kept(super().create_subscription(kind, topic, callback, qos, **options))
 
     def serve(self, name: str, work: Callable[[], str]) -> None:
-        """Offer a Trigger: `work` returns what was done, or raises `InputError` to refuse."""
+        """Offer a Trigger: `work` returns what was done, or refuses by an InputError."""
         def answer(request: Any, response: Any) -> Any:
             try:
                 response.message, response.success = work(), True
@@ -347,8 +347,8 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
 
 def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
     """Return the unconfigured managed version of a kind of node (design.ros2.org)."""
-    # Before the node is active, it has only parameters and lifecycle services.  After a failed
-    # transition, it stays in its former state.
+    # Before the node is active, it has only parameters and lifecycle services.  If an InputError
+    # refuses a transition, the node stays in its former state.
     class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]
         """A node that begins and ends its work by lifecycle transitions."""
 
@@ -370,7 +370,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             change.callback = answer
 
         def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Check that the node can begin; then stop it."""
+            """Check that the node can begin: begin, then stop."""
             def tried() -> None:
                 self.begin()
                 self.stop()

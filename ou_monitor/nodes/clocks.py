@@ -112,7 +112,7 @@ class SendClock:
 
     def __init__(self) -> None:
         # Whether times are unusable, because messages come in bursts and no steady source is
-        # detected; and how often this has ended.
+        # detected; how often `in_bursts` has ended.
         self.in_bursts = False
         self.settled = 0
         self._lumps = 0
@@ -179,7 +179,7 @@ class SendClock:
             self._last = end - self._period
 
     def _record_bursts(self, in_bursts: bool) -> bool:
-        """Record whether times are unusable; return false when they become usable."""
+        """Record whether times are unusable; return False when they become usable."""
         settled = self.in_bursts and not in_bursts
         self.settled += settled
         self.in_bursts = in_bursts
@@ -201,8 +201,8 @@ PAIRS = 50
 # Deviation from the line, s of the sender's time, above which the clock has jumped (next pass of a
 # bag, seek), because no publication is that late.
 STEP = 0.25
-# Silence after which the clock has stopped, so that later messages have no simulated time: s of
-# the sender's time, and number of the clock's intervals (the longer of both).
+# Silence after which the clock counts as stopped, so that later messages have no simulated time:
+# s of the sender's time, and number of the clock's intervals (the longer of the two applies).
 STOPPED, MISSED = 1.0, 5.0
 
 

@@ -43,7 +43,7 @@ BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
 # Maximum time for which a message counts as having waited in the middleware's queue, s.
 MOST_WAIT = 60.0
-# Period of reminders, and silence of a publisher that is reported, s.
+# Period of reminders, s, and silence after which a publisher is reported, s.
 AGAIN = 60.0
 MUTE = 10.0
 # Sentence for a missing clock in the diagnostics of every node.
@@ -119,7 +119,7 @@ class Arrivals:
     column: FieldColumn  # Their contents; the sending time replaces a missing stamp
     # When the middleware received each message, by the wall clock, s; shape (m,).
     received: FloatArray
-    arrived: FloatArray  # The same, by the monotonic clock, s; shape (m,)
+    arrived: FloatArray  # The same times by the monotonic clock, s; shape (m,)
 
     def split(self, at: int) -> tuple[Arrivals, Arrivals]:
         """Return the first `at` messages, and the rest."""
@@ -225,7 +225,7 @@ class Silence:
 
     @property
     def age(self) -> float | None:
-        """Seconds since the last arrival; None before the first."""
+        """Seconds since the last arrival; None before the first arrival."""
         return None if self._last == -math.inf else self._now() - self._last
 
     @property
@@ -294,7 +294,7 @@ def types_on(node: Node, topic: str) -> list[str]:
 
 
 class Console:
-    """Logs changes with the node's logger."""
+    """Logs missing inputs and changes of the flag."""
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node

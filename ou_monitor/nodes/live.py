@@ -32,7 +32,7 @@ CONNECTIONS = 64
 PATIENCE = 10.0
 # Maximum header and body of a request, bytes; browsers send a header of about 1000, and no body.
 _HEADER, _BODY = 16384, 0
-# Maximum number of digits that are parsed, because Python raises an error for a few thousand.
+# Maximum number of digits parsed as a row number: Python raises an error for a few thousand.
 _DIGITS = 18
 # Period of the comment lines that keep an idle connection open, s.
 _ALIVE = 5.0
@@ -41,7 +41,7 @@ _ALIVE = 5.0
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     if not args.host:
-        raise InputError('--host: the address is empty; 0.0.0.0 listens on all')
+        raise InputError('--host: the address is empty; 0.0.0.0 listens on all addresses')
     try:
         import tornado.web  # noqa: F401
     except ImportError as error:
