@@ -13,17 +13,17 @@ import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from ou_monitor.timeline import new_readings
 
-# Maximum values used to find the step and clipping.
+# Maximum number of values used to find the step and clipping.
 EXAMINED = 200_000
 # Relative rounding error of the difference of two float32.
 _FLOAT32 = 2.5e-7
-# Minimum share of the samples on the grid of codes, and their maximum distance from it, steps.
+# Minimum share of the samples that lie on the grid of codes; maximum distance from it, steps.
 _SHARE, _NEAR = 0.99, 0.1
 # Minimum step of the ADC, in units of the last printed digit (below two, every value is near a
 # code); minimum number of gaps between codes; numbers of decimals tried.
 _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
-# Minimum number of equal changes in `usual_change`: without ADC codes no two are equal.
+# Minimum number of equal changes in `usual_change`: without ADC codes, no two changes are equal.
 _AGAIN = 20
 # Clipping: minimum samples at the limit, visits to it, and excess over neighbouring codes in
 # standard errors.
@@ -65,8 +65,8 @@ def usual_change(voltage: FloatArray) -> float:
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
     size = np.sort(np.abs(np.diff(voltage[:EXAMINED])))
     size = size[size > rounding]
-    # `same` counts sizes that are equal within rounding; it must be most of `near`, the sizes
-    # within ten times that distance: changes of a smooth line are close too, but evenly spread.
+    # `same` counts the sizes equal within rounding, `near` those within ten times that distance.
+    # `same` must be most of `near`: sizes of a smooth line are close too, but evenly spread.
     same, near = (np.searchsorted(size, size + by * rounding, 'right')
                   - np.searchsorted(size, size - by * rounding) for by in (0.5, 5.0))
     count = np.where(2 * same > near, same, 0)
@@ -149,7 +149,7 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _leans_up(below: FloatArray, codes: int, step: float) -> bool:
-    """Return whether, next to the fullest of the top codes, the higher code is the fuller one."""
+    """Return whether the fullest of the top codes has more samples just above than just below."""
     # Noise after clipping lowers as many readings as it raises.
     count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
     full = max(range(codes), key=lambda k: count[k])
@@ -195,19 +195,20 @@ def _clipping_limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) ->
     return math.inf
 
 
-# Minimum number of repeats, or of runs of repeats; maximum probability of a tie at which the size
-# of the changes predicts the number of ties.
+# Minimum number of repeats, or of runs of repeats; probability of a tie below which the size of
+# the changes predicts the number of ties.
 _FEWEST_TIES, _FINE = 20, 0.15
 # Lags at which equal values are counted (lag 8 still detects that seven of ten samples are held),
 # and longer lags, at which the period of a line is sought.
 _APART, _PERIODS = (2, 4, 8), range(9, 101)
 # Maximum ratio of a rail's noise to its noise at rest, and hence of the probabilities of a tie.
 _CALMEST = 100.0
-# Minimum excess of ties, and maximum deficit of the changes at the ends of runs, standard errors.
+# Minimum excess of ties, and maximum deficit in size of the changes at ends of runs, both in
+# standard errors.
 _CLEARLY, _SHORT = 6.0, 3.0
-# Share of the readings at either end of the range, whose runs may come from clipping.
+# Share of the readings at either end of the range; their runs may come from clipping.
 _END = 0.1
-# Maximum samples used to find repeats.
+# Maximum number of samples used to find repeats.
 _EXAMINED = 200_000
 
 
@@ -243,7 +244,7 @@ def _has_excess_ties(v: FloatArray) -> bool:
         return False
     share = _ties_without_holds(v, inner)
     if int(((step[1:] == 0.0) & (step[:-1] != 0.0)).sum()) < _FEWEST_TIES:
-        # Ties are likelier at rest, up to a limit; beyond it the sensor was stuck.
+        # Ties are likelier at rest, but only up to a limit: more of them mean a stuck sensor.
         share = min(share, _CALMEST * chance)
     expected = count * max(chance if chance < _FINE else 0.0, share)
     smooth, error = _ties_of_codes(moved, code)

@@ -22,7 +22,7 @@ from ou_monitor.records import FloatArray
 
 # Maximum rounds in which laws and Gaussian part are refitted.
 _ROUNDS = 3
-# Limits of a factor on the noise; convergence tolerance of its mean change, in logarithms.
+# Limits of a factor on the noise; convergence tolerance: mean change of its logarithm.
 _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
 # Processor time of the fastest law with a `SLOW_FIT`, s per sample.
@@ -40,7 +40,7 @@ class Composite:
     gaussian: GaussianFit
     z: FloatArray  # Normal scores of the one-step predictions; shape (n,)
     density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
-    free: int
+    free: int  # Number of fitted parameters
     search: float  # Penalty for searched alternatives, nats
     events: Events | None = None  # Events from the laws, used in the Gaussian part
     offset: FloatArray | None = None  # Offset from the laws, used likewise, V; shape (n,)

@@ -18,8 +18,8 @@ def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, Floa
     return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(heights, dtype=np.float64), 2)
 
 
-# Margin on either side of the recorded range, as a share of it.  The extremes of two halves of a
-# stationary flight differ by less; with a wrong sag or a growing drift, they differ by more.
+# Margin on either side of the recorded range, as a share of the range.  The extremes of two halves
+# of a stationary flight differ by less; a wrong sag or a growing drift moves them by more.
 MARGIN = 0.5
 
 

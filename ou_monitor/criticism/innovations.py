@@ -13,9 +13,9 @@ correlations at single lags would miss a second OU ten times slower, which is co
 hundreds of samples.
 
 An AC-coupled instrument is a high-pass: the ordinates below its corner are too small.  Their sum
-is tested by the gamma distribution, which is exact for few ordinates too (the lower tail of the
-score is not).  A detection requires that more than half of the power is missing there, because
-the regression of the mean also removes some.
+is tested by the gamma distribution, which is exact even for few ordinates, unlike the lower tail
+of the score.  A detection requires that more than half of the power below the corner is missing,
+because the regression of the mean removes some power, too.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
 absorbed by the fit; linear drifts are removed; samples are treated as evenly spaced.
@@ -33,8 +33,8 @@ from ou_monitor.records import FloatArray, NAN
 from scipy import stats
 from scipy.signal import periodogram
 
-# Probability that any test rejects a right model: in `analyze` over all levels of a recording, in
-# `discover` over the whole recording.  One in a hundred, as for lines.
+# Probability that any test rejects a right model: in `analyze`, over all levels of a recording; in
+# `discover`, over the whole recording.  The same as for lines.
 FAMILY_WISE = 0.01
 # Minimum variance of a second relaxation that matters, as a share of Var_inf.
 LEAST_SHARE = 0.1
@@ -64,8 +64,8 @@ def steps_before(t: FloatArray) -> FloatArray:
     """Return the time before each sample, s; infinite before the first."""
     step = np.diff(t, prepend=-np.inf)
     usual = float(np.median(step[1:]))
-    # Set nearly equal steps equal: this changes predictions by much less than their error, and
-    # saves most of the time of the filter.
+    # Set nearly equal steps equal: that changes predictions by much less than their error, and
+    # saves most of the filter's time.
     step[np.abs(step - usual) < ALIKE * usual] = usual
     return step
 

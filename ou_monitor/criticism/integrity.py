@@ -32,7 +32,7 @@ LEAST = 100
 NAMED_STEP = 0.3
 # Minimum range of throttle; if it moves less, it is not used.
 MOVES = 0.01
-# Maximum samples, as logged, that are kept for the score of the plain model.
+# Maximum number of samples kept as logged, for the score of the plain model.
 _EXAMINED = 200_000
 
 
@@ -48,7 +48,7 @@ class Integrity:
     # `samples`.
     raw: Samples | None = None
     full: float = NAN  # Current at which the load is 1, A; NaN if the load is throttle
-    # Clipped samples, replaced by random draws and so not scored; shape (samples.n,).
+    # Clipped samples, which are replaced by random draws and so not scored; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 
 
@@ -152,8 +152,8 @@ def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> 
     return None
 
 
-# Scatter of stamps about a grid, as a share of a step: below the first it is ignored, above the
-# second there is no grid.
+# Scatter of stamps about a grid, as a share of a step: below `_SMALL` it is ignored, above
+# `_LARGE` there is no grid.
 _SMALL, _LARGE = 0.02, 0.45
 # Correlation of neighbouring errors up to which they count as independent.
 _WHITE = 0.3

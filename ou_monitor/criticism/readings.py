@@ -17,16 +17,16 @@ from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, supplied
 from scipy.special import chdtri
 
-# Minimum distance of an outlier from the median: in standard deviations, and as a multiple of the
-# distance of the next closer sample.
+# Minimum distance of an outlier from the median: in standard deviations, and relative to the next
+# smaller distance.
 _FAR, _GAP = 50.0, 5.0
 # Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
-# Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
+# Maximum number of single bad samples left out; in long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
 # Minimum number of other samples if the share of an error code exceeds _MOST_CODES.
 _OTHERS = 100
-# Maximum values used for the spread.
+# Maximum number of values used for the spread.
 _EXAMINED = 200_000
 # A voltage counts as constant if at most this number, or this share, of samples differ.
 _ODD, _ODD_SHARE = 3, 1e-3
@@ -34,8 +34,8 @@ _ODD, _ODD_SHARE = 3, 1e-3
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
-# Largest throttle, with trim, and tolerance of the range 0..1; the readers of recordings have
-# converted or refused other units.
+# Largest plausible throttle, with trim, and tolerance of the range 0..1; the readers of recordings
+# have already converted or refused other units.
 _MOST, _EDGE = 1.5, 0.05
 # Maximum gap in a current, s; quantile of its absolute value that counts as full load; lags of the
 # mean response to a load, s.
@@ -96,7 +96,7 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
             notes: list[str]) -> tuple[FloatArray | None, float]:
     """Return the load, and the current at which it is 1, A; NaN if the load is throttle."""
-    # t in s, v in V.  The current, divided by its 99 % quantile, is the load unless throttle
+    # t in s, v in V.  The current (divided by its 99 % quantile) is the load unless throttle
     # predicts the voltage clearly better.
     moved: list[str] = []
     if u is not None:
@@ -120,8 +120,8 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     why = 'throttle was not recorded' if u is None else (
         f'it predicts the voltage better than throttle, by {number(gain)} nats' if gain > limit
         else 'it predicts the voltage as well as throttle')
-    notes += [f'The load is the measured current ({why}). Parameters are for a current of 1 '
-              f'= {number(full)} A.', *said]
+    notes += [f'The load is the measured current ({why}). Parameters are for a load of 1, which '
+              f'is {number(full)} A.', *said]
     return current / full, full
 
 

@@ -30,10 +30,10 @@ TRAIN = 0.6
 MOST = 80_000
 # Maximum step, in relaxation times, at which alpha stays identifiable.
 _STEP = 0.3
-# (gamma(2L) - gamma(L)) / (gamma(4L) - gamma(2L)) at that step L, with the variogram gamma of an
-# OU: exp(x) / (1 + exp(-x)), x = _STEP.  White noise cancels.
+# (gamma(2L) - gamma(L)) / (gamma(4L) - gamma(2L)) of an OU's variogram gamma at that step L:
+# exp(x) / (1 + exp(-x)), x = _STEP.  White noise cancels.
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
-# Maximum values used for that ratio.
+# Maximum number of values used for that ratio.
 _EXAMINED = 1_000_000
 # Samples that share a noise scale; probability that noise alone makes any change an event; margin
 # for the error of the scale.
@@ -41,8 +41,8 @@ _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
 # Minimum change of throttle that counts as a load step, and the time after it in which a change of
 # voltage is attributed to the load, s.
 _STEPS, _SOON = 0.01, 0.02
-# Maximum number of events around which more samples are kept; if there are more events, the
-# samples used contain enough of them.
+# Maximum number of events around which more samples are kept; of more events, the samples used
+# contain enough.
 _FEW = 300
 # Changes are limited to this many standard deviations in the search for lines (larger ones are
 # events); minimum share of a line's power that one sinusoid explains.

@@ -383,8 +383,8 @@ def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size:
 def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
                      size: int = SIZE) -> NullBank:
     """Simulate the null distributions for a model with more terms than the `ou`."""
-    # Needed if the step of the ADC is as large as the noise: then errors of the right model are
-    # neither normal nor independent.
+    # Needed if the ADC's step is as large as the noise: then even the errors of the right model
+    # are neither normal nor independent.
     model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
     for _ in range(size):
         y = model.simulate(samples.t, rng, samples.throttle)

@@ -28,7 +28,7 @@ from ou_monitor.records import FloatArray
 NO_NOISE = 1e-6
 # Step of the numerical derivatives (scores), in the logarithm of a parameter.
 _STEP = 1e-4
-# Maximum rounds of a fit, of a rough one, and of a last one that begins near the maximum.
+# Maximum rounds of a full fit, of a rough fit, and of a last fit that begins near the maximum.
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
 # Samples times additional states above which a fit begins with a part of the samples.
 _EXPENSIVE = 30000
@@ -114,7 +114,7 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              events: Events | None = None, offset: FloatArray | None = None, *,
              own: bool = False) -> FloatArray:
     """Return voltage, level and columns of the mean, whitened by the noise of a model."""
-    # own: return the columns of the model's terms, then of `more`.  Otherwise return the columns
+    # own: return the columns of the model's terms, then of `more`.  If not own: return the columns
     # of `more`, and subtract the model's terms that are not `MEASURED` from the voltage.  The
     # offset, V, is always subtracted.
     run = _filter(samples, terms, events)
@@ -296,7 +296,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         if states[1] > _MANY:
             return _with_mean(samples, terms, events)
     elif states[0] * (states[1] - 1) > _EXPENSIVE and few < samples.n:
-        # Begin with a part of the samples; keep the start in case it fits all samples better.
+        # Begin with a part of the samples; keep `begin` in case it fits all samples better.
         part = _busiest_part(samples, few)
         begin = terms
         first = _maximise(
@@ -451,7 +451,7 @@ def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray
     for term in terms:
         if isinstance(term, ACCoupling):
             design = design.copy()
-            # Column 1, the level, is unchanged: behind an AC coupling it is a free parameter.
+            # Do not filter column 1, the level: behind an AC coupling it is a free parameter.
             design[:, 2:] = term.pass_through(design[:, 2:], s)
     return design
 
