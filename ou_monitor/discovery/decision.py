@@ -27,13 +27,13 @@ ACCEPT = 4.0
 # Difference in evidence below which two causes tie, nats: odds of 20.  A cause whose removal costs
 # less is removed.
 TIE = 3.0
-# A further term with less than this share of the larger effect's evidence only corrects the form
-# of that effect (FORM: a response of the mean, CURVE: a second curve of intensity over throttle).
+# A further term with less than this share of an effect's evidence only corrects the effect's form
+# (FORM: for a response of the mean; CURVE: for a second curve of intensity over throttle).
 # A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
 # (test/hidden), further terms gained at most 0.8 % if the form was right.
 FORM, CURVE = 0.005, 0.1
-# Evidence per sample with which a term that only corrects a form is accepted too, nats: errors
-# shrink by 2 %.  An unmodelled lag of that size biases alpha, or imitates a latent cause.
+# Evidence per sample, nats, from which even a term that only corrects a form is accepted: it
+# shrinks errors by 2 %.  An unmodelled lag of that size biases alpha, or imitates a latent cause.
 VISIBLE = 0.02
 # Minimum number of relaxation times in a recording; with fewer, the OU counts as a trend.  At this
 # limit, the relative error of its rate is sqrt(2/20) = 30 %.
@@ -42,12 +42,12 @@ RELAXES = 20.0
 CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
-# Total filter time after which kinds whose fit takes seconds are no longer tried, s.  For BROAD
-# kinds it is doubled: a spectrum shows beforehand whether they gain, and without them a slow
+# Total filter time after which kinds whose fit takes seconds are no longer tried, s; twice as long
+# for BROAD kinds, because a spectrum shows beforehand whether they gain, and without them a slow
 # residual of the response to throttle can halve the fitted alpha.
 MOST_COST = 10.0
 # Limit of a statistic: by theory, any of 70 exceeds it by chance in 1 of 2300 recordings; in
-# simulations, it was 3 of 8700.
+# simulations, any did in 3 of 8700.
 FAILS = 4.8
 # Maximum share of its initial value that a statistic may keep: the form of a cause is never exact.
 OWN_SHARE = 0.07
@@ -61,10 +61,10 @@ BESIDE_SHARE = 0.3
 
 def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection[str],
                  throttle: bool, first: bool) -> list[Kind]:
-    """Return the kinds to add to a model: those that come first (`first`), or else the others."""
+    """Return the kinds to try in a model: if `first`, those that come first, else the others."""
     # Measured inputs come first, because latent causes imitate them, and white noise, because
-    # every sensor has it.  The regression chooses responses of the mean, except that a trend is
-    # also tried together with latent causes, which imitate it.
+    # every sensor has it.  Responses of the mean are left to the regression, except a trend, which
+    # is also tried here together with latent causes, because they imitate it.
     return [kind for kind in kinds
             if kind.NAME not in ('ou', *given) and kind.ROLE is not Role.EXACT
             and ((kind.MEASURED and not is_response(kind)) or kind.ROLE is Role.NOISE) is first
@@ -100,9 +100,9 @@ def affordable(kind: Kind, cost: float) -> bool:
 # -- acceptance of trials
 
 def least_evidence(kind: Kind, largest: float, again: int = 0) -> float:
-    """Return the minimum evidence of a response, nats (largest: evidence of all together)."""
-    # again: number of samples if the model already has a term of this kind, because another one
-    # may only correct its form; otherwise 0.
+    """Return the minimum evidence of a response, nats (largest: of all responses together)."""
+    # again: number of samples if the model already has a term of this kind, whose form the new one
+    # may only correct; otherwise 0.
     least = min(FORM * largest, VISIBLE * again)
     return max(ACCEPT, kind.LEAST_SHARE * largest, least)
 
@@ -170,7 +170,7 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
     # real flight.  Then a latent cause is tested by its own signs only, relative to their values
     # with the measured causes alone (`before`) or just before its acceptance (`before_accepted`,
     # by name), since a larger effect may have hidden them.  Without measured causes, latent ones
-    # that have no MAY_LEAVE are tested by all statistics: the effect may be none of the catalogue.
+    # that have no MAY_LEAVE are tested by all statistics: the effect may not be in the catalogue.
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)
 

@@ -45,8 +45,8 @@ from ou_monitor.text import listed, number, Z95
 FAST = 'the rate of the samples used is too low to show this line.'
 # Alternations between drawing clipped or coarse samples and fitting the load to them.
 _REDRAWN = 3
-# Alternations that also choose the terms of the load: first from the codes, then from readings
-# drawn within them.
+# Number of these alternations that also choose the terms of the load: first from the codes, then
+# from readings drawn within the codes.
 _SEARCHED = 2
 # Maximum sampling step, in relaxation times, that still shows the relaxation.
 _BLIND = 1.0
@@ -238,9 +238,9 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
             plain: HeldOut, scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]
             ) -> tuple[Cause, ...]:
     """Return all causes: exact findings first, then the causes that the search named."""
-    # The gain of a cause is the loss of the model refitted without it.  If there are many
+    # The gain of a cause is what the model loses when refitted without it.  If there are many
     # causes of one kind (harmonics of a line), they are left out together and share one gain.
-    # Repeats, clipping and wrong stamps, which are corrected in the samples, also share one gain:
+    # Repeats, clipping and wrong stamps, which are corrected in the samples, share one gain, too:
     # what the plain OU loses if it is fitted to the samples as logged.
     found: list[Cause] = []
     model = left.full.model
@@ -330,7 +330,7 @@ def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
            larger: bool = False, fall: LoadFall = LoadFall(), more: Sequence[str] = ()
            ) -> tuple[str, ...]:
     """Return objections to a model besides its statistics, in words (times in s)."""
-    # larger: whether its one-step errors are larger than those of the plain OU.
+    # larger: whether one-step errors of the model are larger than the plain OU's.
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
     if dips.worse:
         found.append(f'it dips below {dips.level:g} V {number(dips.extended)} times a minute; the '
@@ -346,7 +346,7 @@ def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
 
 
 def _of_the_path(model: Composite, samples: Samples) -> list[str]:
-    """Return objections of the terms to the path of states or levels that was found."""
+    """Return objections of the terms to the path of states or levels that their laws found."""
     path = model.offset if model.offset is not None else (
         None if model.events is None else np.log(model.events.power))
     said = [] if path is None else [term.objection(path, samples.t) for term in model.terms]

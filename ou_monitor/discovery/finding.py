@@ -83,7 +83,7 @@ class LowDips:
 
     level: float = NAN  # V
     count: int = 0  # Dips in the samples
-    made: int | None = None  # Dips that the lowest load would avoid; None: no load response
+    made: int | None = None  # Dips that the lowest load would not cause; None: no load response
     # Dips per minute in the samples and on average in simulations.
     observed: float = NAN
     baseline: float = NAN
@@ -110,7 +110,7 @@ class LowDips:
             'observed', 'baseline', 'extended', 'observed_se', 'baseline_se', 'extended_se')}
 
 
-# Relative error of a fall under load above which the model does not reproduce it.
+# Relative error above which the model does not reproduce a fall under load.
 _WRONG = 0.5
 
 
@@ -155,7 +155,7 @@ class Finding:
     gain_se: float = NAN
     # Relative reduction of the rms of one-step errors on held-out blocks, against the plain OU.
     shrink: float = NAN
-    larger: bool = False  # Whether these errors are significantly larger than the plain OU's
+    larger: bool = False  # Whether these errors exceed the plain OU's by a standard error
     dips: LowDips = LowDips()
     fall: LoadFall = LoadFall()
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided

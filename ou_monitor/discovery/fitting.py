@@ -34,7 +34,7 @@ _FULL, _PREVIEW, _FEW = 2, 8000, 4
 _WITHIN = 0.5
 # Maximum alternations between the fit and the `APART` parameters of its terms.
 _AGAIN = 3
-# Gains of two fits, nats, and normal scores that differ by less count as equal.
+# Differences below which the gains of two fits, nats, and normal scores count as equal.
 _ALIKE, _SAME = 0.1, 1e-6
 # Degree of a smooth drift, as of a discharge under changing load, and the variance inflation
 # factor above which the load counts as collinear with it: flights have 1.0 to 1.4, staircases and
@@ -64,9 +64,9 @@ class Fitter:
 
     samples: Samples
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
-    # For each law, the scores to which it was last fitted, and the result.
+    # For each law: the scores to which it was last fitted, and that fit (None: it failed).
     law_fits: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
-    # Kinds tried without success, and their gain by score tests then, nats.
+    # Kinds that were tried without success, with their gain by score tests at that time, nats.
     failed: dict[str, float] = field(default_factory=dict)
 
     def evidence(self, composite: Composite) -> float:
@@ -132,7 +132,7 @@ class Fitter:
         """Return kinds that improve a model: all are estimated, the best few fitted in full."""
         # Kinds that failed are tried again if their gain by score tests is larger now.  Kinds that
         # are slow to fit come last, and only if they imitate the best other kind, or if score
-        # tests still show them once it is added.
+        # tests still show them once that kind is added.
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.SLOW_FIT
@@ -256,7 +256,7 @@ class Fitter:
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
                  for start in starts]
-        # If a start gains less than the penalty in the spectrum, it does so in the samples too.
+        # A start that gains less than the penalty in the spectrum does so in the samples, too.
         moved = sorted((fit for fit in moved if fit[0][-1].holds(view)
                         and fit[1] > max(decision.ACCEPT, least)), key=lambda fit: -fit[1])
         # Starts with the same gain have converged to one fit.

@@ -66,14 +66,13 @@ def if_known(gain: float, error: float) -> tuple[float, float]:
 def without(samples: Samples, model: Composite, *indices: int, plain: Composite | None = None
             ) -> Composite | None:
     """Return the model fitted to everything without some of its terms; None if that fails."""
-    # If the fit is worse than the plain one, it has not converged, and is repeated from another
-    # start.
+    # A fit worse than `plain` has not converged, and is repeated from another start.
     kept = _complete(term for k, term in enumerate(model.terms) if k not in indices)
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
     known = None if laws else model
     found = [_fitted(samples, kept, known)]
-    # A model with further states may be fitted to only a part of the samples.  Effects that the
-    # `ou` must explain in their place may be missing there.  So also fit all, without the states.
+    # A model with further states may be fitted to only a part of the samples, and effects that the
+    # `ou` must now explain may be missing in that part.  So also fit all samples, without states.
     light = _complete(term for term in kept if term.ROLE is not Role.BLOCK)
     if len(light) < len(kept):
         found.append(_fitted(samples, light, known))
@@ -129,7 +128,7 @@ def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> floa
 
 
 def errors_grew(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_], errors: float) -> bool:
-    """Return whether one-step errors are significantly larger than before."""
+    """Return whether one-step errors grew by more than `errors` standard errors."""
     both = scored & new.known & old.known
     return errors_grow(new.error[both], old.error[both], new.model.gaussian.variance[both], errors)
 

@@ -45,7 +45,7 @@ class Named:
     whole: Composite  # Model fitted to everything
     bank: NullBank  # Calibration of the statistics
     names: tuple[str, ...]  # Causes in the order of acceptance
-    rivals: Mapping[str, list[str]]  # For each, the causes that tie with it
+    rivals: Mapping[str, list[str]]  # For each cause, the causes that tie with it
     dropped: tuple[str, ...]  # Causes that were withdrawn
     # Statistics of the plain and of the extended model.
     before: Mapping[str, float]
@@ -75,7 +75,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         begun = found = _fit_everything(fitter, search, bank)
         for turn in range(_TURNS):
             less = search.copy()
-            # The last turn is without latent causes, which were withdrawn repeatedly.
+            # In the last turn, name no latent causes: those named were withdrawn repeatedly.
             name_causes(fitter, search, bank, given=[*given, *dropped],
                         latent=turn < _TURNS - 1,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))

@@ -1,8 +1,8 @@
 """
 Remove causes that do not improve predictions of held-out blocks, and check the model.
 
-A cause is removed if the rest, refitted, predicts held-out blocks equally well.  The others are
-then tested again, because one of them may take over its effect.
+A cause is removed if the rest, refitted, predicts held-out blocks equally well.  The other causes
+are then tested again, because one of them may now account for the effect of the removed one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class Worth:
-    """Loss of the model without a group of terms."""
+    """What the model loses without a group of terms."""
 
     # Gain and standard error, nats per sample.
     gain: float = NAN

@@ -4,7 +4,7 @@ Response of the mean to throttle, its lags, and time, by regression on whitened 
 The recording and the columns of all candidates are whitened by the noise found so far; then any
 set of terms is a small linear system.  Its evidence is the smaller of two: the likelihood less its
 penalty (BIC), and the gain in cross-validation over blocks.  The first guards against noise, the
-second against a form that only improves one part of the recording.  Starting from the load model,
+second against a form that improves only one part of the recording.  Starting from the load model,
 terms are added and removed one at a time.
 
 Limits: delays and time constants come from a list before they are refined; the noise is not
@@ -182,7 +182,7 @@ class _Regression:
         for k in start:
             chosen = self._with_term(chosen, k)
         chosen = self._moved(chosen)
-        # So far the set may contain both a time constant and its replacement.
+        # So far, the set may contain a time constant together with its replacement.
         self._apart = True
         while self._has_twins(chosen):
             chosen = max((self._less(chosen, k) for k in chosen),

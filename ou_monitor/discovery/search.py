@@ -47,7 +47,7 @@ _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# If the best fit of a round takes less time than this, s, the response to load is chosen again.
+# If the best fit of a round takes less time than this, s, the response to load is chosen anew.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
 # maximum lines added in one round.
@@ -89,7 +89,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             search.before_accepted[best.name] = criticise(fitter.samples, search.composite, bank)
         _accept(search, best, trials)
         if catalogue()[best.name].ROLE is Role.LAW or catalogue()[best.name].FAMILY == 'line':
-            # Outliers and lines have hidden smaller effects so far.
+            # Outliers and lines may have hidden smaller effects until now: try all kinds again.
             fitter.failed.clear()
         if best.composite.gaussian.cost < _SOON:
             choose_response(fitter, search, ())
@@ -292,8 +292,8 @@ def _leaves_range(fitter: Fitter, model: Composite) -> bool:
     return follows and outside_range(fitter.samples, model.terms, 1.0) > 0.0
 
 
-# Initial rate of the residual after load, 1/s; a fit that starts here converges to relaxation
-# times from tenths of a second to minutes.
+# Initial rate of the slow residual of the load, 1/s; a fit that starts here converges to
+# relaxation times from tenths of a second to minutes.
 _SLOW = 1.0
 
 
