@@ -1,5 +1,5 @@
 """
-The files of a node: its model, and the latch of the flag, which survives a restart.
+The files of a node: the model file, and the latch file, which keeps a latched flag over a restart.
 
 A model file is replaced only if it is a regular file and still has the bytes that were read.  The
 latch is a small file with one JSON object: node, level (OK or CRITICAL), reason and time.  While

@@ -44,8 +44,8 @@ FLUSH = Duration(seconds=1)
 RCLError = rclpy_implementation.RCLError
 
 Message = tuple[str, str, int, bytes]
-# Number of messages in a batch of the thread, and maximum number of batches read ahead: about 20 s
-# at 10 kHz, and 50 MB.
+# Number of messages in a batch, and maximum number of batches that the thread reads ahead: about
+# 20 s at 10 kHz, and 50 MB.
 BATCH, AHEAD = 1000, 200
 
 

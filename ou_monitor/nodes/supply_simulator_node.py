@@ -49,8 +49,8 @@ FIXED_PARAMETERS: tuple[Parameter, ...] = (
 _SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name != 'adc.sample_rate')
 # Message types that are used if the parameters specify none.
 _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
-# Up to this rate, Hz, samples are drawn one by one; above it, in pieces of this length, s, because
-# a call of the model takes 0.2 ms of CPU, and waking the thread costs as much as a message.
+# Rate, Hz, above which samples are not drawn one by one but in pieces of this length, s: a call of
+# the model takes 0.2 ms of CPU, and waking the thread costs as much as a message.
 _EACH, _AHEAD = 200.0, 0.02
 # Time for which the last throttle is held, s; after it, throttle is 0.
 _HOLD = 1.0

@@ -130,7 +130,7 @@ class Lever:
 
 @dataclass(frozen=True)
 class Design:
-    """The answer for one network, throttle and target."""
+    """The result for one network, throttle and target."""
 
     network: PowerNetwork  # Components.
     rail: str  # ``bus`` or ``regulated``.

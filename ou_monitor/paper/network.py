@@ -25,9 +25,9 @@ the paper would need 0.4 F.  Exceptions:
 - Slow noise.  If the noise relaxes more slowly than the pole (a small C, or flutter), alpha is the
   rate of the noise and does not depend on C.
 - ESR.  With r fixed, fast noise of the current causes at least (R r / (R + r))^2 times its own
-  variance in the voltage, whatever C is.  As C rises, the share of the pole falls; below 1 %,
-  alpha jumps up to the next pole, the rate of the noise.  With r C fixed (capacitors of one
-  series in parallel), neither happens on the bus.
+  variance in the voltage, whatever C is.  As C rises, the pole's share of Var_inf falls; below
+  1 %, alpha jumps up to the next pole, the rate of the noise.  With r C fixed (capacitors of one
+  series in parallel), neither effect occurs on the bus.
 """
 
 from __future__ import annotations

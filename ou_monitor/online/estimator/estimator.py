@@ -435,7 +435,7 @@ class BlockAverager:
         self._stamps = np.empty(0)
 
     def waiting(self, since: float) -> FloatArray:
-        """Return the stamps, not before `since`, that wait for the rate or for a whole block."""
+        """Return the stamps, from `since` on, of samples that wait for a rate or a full block."""
         stamps: FloatArray = self._rest[0]
         return stamps[stamps >= since]
 
@@ -475,7 +475,7 @@ class BlockAverager:
         return before not in (0, self.m)
 
     def _blocks(self, columns: FloatArray) -> FloatArray:
-        """Average whole blocks; an incomplete block waits, or is dropped before a break."""
+        """Average full blocks; an incomplete block waits for more samples; a gap drops it."""
         m = self.m
         gaps = np.flatnonzero(np.abs(np.diff(columns[0]) - self.step) > UNEVEN * m * self.step) + 1
         parts = []
@@ -487,7 +487,7 @@ class BlockAverager:
 
 
 class RelaxationFits:
-    """Readings of the last minute, and their newest fit; `end`: last stamp of the fit, s."""
+    """Readings of the last minute, and the newest fit to them; `end`: its last stamp, s."""
 
     def __init__(self, *, background: bool) -> None:
         self._background = background

@@ -163,7 +163,7 @@ def _ends(n: int) -> tuple[FloatArray, FloatArray]:
 
 
 class SpectralLikelihood:
-    """Whittle likelihood of samples, or means of m, in even stretches; last row: voltage."""
+    """Whittle likelihood of evenly spaced samples, or means of m; last row: the voltage, V."""
 
     def __init__(self, rows: FloatArray, lengths: list[int], step: float, m: int = 1) -> None:
         self.n, self.m, self.step = rows.shape[1], m, step
@@ -402,15 +402,15 @@ _APART = 1e-5
 # Number of samples averaged into one sample of a coarser grid; minimum number of samples on that
 # grid.
 _FACTOR, _FEWEST = 4, 100
-# An ADC step acts as white noise only if the OU crosses several codes between two samples, which
-# must be at least (0.7 step / sigma)^2 s apart (doc/estimation.md).
+# Minimum rms movement of the OU between two samples, in ADC steps, with which the ADC's rounding
+# acts as white noise; with less, a coarser grid is used.
 _DITHER = 0.7
 # Correction of the bias of alpha, in 1/T, for the spectral likelihood and for the exact one.  The
 # exact restricted likelihood makes alpha too high by 2/T (Tang & Chen, J. Econometrics 149 (2009)
 # 65: 4/T with unknown mean, half of it from the mean), the spectral one by 0.1/T to 1.2/T, or by
 # 1.6/T to 2.5/T with 5 mV of noise (600 simulated windows each of 12 to 126 relaxation times).
 # Var_inf = sigma^2 / (2 alpha) is convex in alpha, so one correction for both parameters is a
-# compromise: Var_inf remains too high, by 0.5/(alpha T) and 1.3/(alpha T).
+# compromise: Var_inf remains too high, by 0.5/(alpha T) (spectral) and 1.3/(alpha T) (exact).
 _HIGH_BY = (0.5, 1.5)
 # Share of the mean square below which a residual, or the diffusion of a step, is rounding error.
 _EXACT = 1e-14

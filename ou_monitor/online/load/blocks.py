@@ -9,8 +9,8 @@ Delay: the voltage, without changes slower than a second, is correlated with thr
 delays of 0 to 200 ms.  The largest correlation determines the delay, unless the source is slower
 than 7 Hz.  A new delay is adopted only if it leaves a quarter less variance than the present one.
 
-Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; in a mean of n
-samples, the part of the variance within a block is divided by n.
+Noise: ln variance = b . (1, ripple(u), sqrt|du|) for throttle u and its change du, with b learned
+by Fisher scoring.  In a mean of n samples, the variance within a block is divided by n.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ou_monitor.records import FloatArray, NAN
 
 # Width of the bins, s: motors and pack respond more slowly.
 WIDTH = 0.02
-# Samples farther apart than this, s, are separate blocks.
+# Samples at least this far apart, s, are separate blocks.
 _APART = 0.75 * WIDTH
 # Difference below which throttles count as equal; their sags differ by less than an ADC step.
 EQUAL = 0.01

@@ -66,7 +66,7 @@ class CurrentFilter:
         self._t = self._known_at = self._unit = NAN
         # Largest current used and largest received; last current, A; time with current, s.
         self._largest = self._peak = self._before = self._seen = 0.0
-        # Current at once and after each of LAGS, A.
+        # Present current, and the current behind each of LAGS, A.
         self._drawn: list[float] = []
         self.lost = False
         # Of the last block: voltage without the response to load, V, and log density, nats.

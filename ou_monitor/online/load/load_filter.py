@@ -1,9 +1,9 @@
 """
 The voltage under load, learned in flight by a Kalman filter, without a relaxation rate.
 
-Limits: late throttle makes the sag too small (by a third with 100 ms on a racing quad); outside
-the throttle range flown, the sag is extrapolated; changes of the true sag are followed within
-minutes.  doc/load.md has the equations and the figures.
+Limits: throttle more than 200 ms late, or sampled below 7 Hz, makes the sag too small; outside the
+throttle range flown, the sag is extrapolated; changes of the true sag are followed within minutes.
+doc/load.md has the equations and the figures.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _AHEAD, _PAYS, _COMPARED, _LEAST_COMPARED, _EVERY = 1.0, 0.98, 30.0, 10.0, 0.1
 _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
 # Time constant with which the scale of the load follows the level, s.  If it were shorter, each
 # correction of the level would change the regressors even at constant throttle, and the filter
-# would learn from that.
+# would learn from these changes.
 _RESIZE = 30.0
 # Memory of the throttle flown, s.
 _FLOWN_MEMORY = 120.0
@@ -73,7 +73,7 @@ _DRIFT = _CHANGE * np.eye(_MEAN.size) * (_SIZE / _MEAN[:-1].sum()) ** 2
 
 
 class FastLevel:
-    """A level that follows faster than the filter's, and is used while it predicts better."""
+    """A level that follows faster than the filter's level, for use while it predicts better."""
 
     def __init__(self) -> None:
         # Stamp, s; level plus the fall by discharge, V; variance, V^2; that fall, V; time

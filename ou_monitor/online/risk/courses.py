@@ -132,8 +132,8 @@ def _groups(state: LoadState, u: FloatArray, tau: FloatArray, inrush: FloatArray
 def mean_now(state: LoadState) -> float:
     """Return the mean voltage, V, at the present throttle and lags, without inrush."""
     u = state.throttle
-    answers = np.array([u ** POWER, u, u ** 3, *state.lags])
-    return float(state.mean[0] - state.size * (answers @ state.mean[2:-1]))
+    regressors = np.array([u ** POWER, u, u ** 3, *state.lags])
+    return float(state.mean[0] - state.size * (regressors @ state.mean[2:-1]))
 
 
 def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling: Sampling

@@ -1,5 +1,5 @@
 """
-Brown-out risk by the method that predicts this flight best, and the risk if throttle changes.
+Brown-out risk as a weighted mean of several methods, and the risk if throttle changes.
 
 Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
@@ -7,23 +7,21 @@ used alone if the load is unknown).  First passage is averaged with one of the o
 other method's weight is the share of completed horizons whose lowest voltage contradicts first
 passage.
 
-Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu - start) + e, with
-mean mu, noise s and error r of `lowest`, by least squares with forgetting; e has Student's t
-distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2 + k2 r^2.
+Law learned in flight, by least squares with forgetting over completed horizons: lowest - start =
+b0 s + b1 (mu - start) + e.  start is the mean voltage at the beginning; `lowest` gives mean mu,
+noise s and error r.  e has Student's t distribution with five degrees of freedom, and the variance
+k0 s^2 + k1 (mu - start)^2 + k2 r^2.
 
-Each law is mixed with a wider law, whose weight is the share of horizons that contradict the law
+A law is mixed with a wider one, whose weight is the share of horizons that contradict the law
 (rule of succession).  A horizon counts by the probability that the law was wrong in it, times
-step / horizon if horizons overlap.  For first passage, the other method takes the place of the
-wider law.  For a given throttle, the wider law initially has the width of the excursions, but at
-most `_WIDEST` times the width of the law, because excursions include bursts of throttle, which are
-irrelevant to idling.  This width grows if the contradicting voltages are farther than the width
-below the mean of the law.
+step / horizon if horizons overlap.  First passage is mixed with the other method.  The law for a
+given throttle is mixed with a law that initially has the width of the excursions, but at most
+`_WIDEST` times its own width, because excursions include bursts of throttle, which are irrelevant
+to idling.  The wider law widens further if contradicting voltages lie beyond its width.
 
-Limits, in addition to doc/risk.md: one bias and one gain apply to all throttles; values between
-two horizons are interpolated.
-
-`look_ahead` computes the risk, its curve over throttle, and the throttle budget for the present
-settings.
+`look_ahead` computes the risk, its curve over throttle, and the throttle budget.  Limits, beyond
+those in doc/risk.md: one bias and one gain apply to all throttles; laws are interpolated between
+two horizons.
 """
 
 from __future__ import annotations
