@@ -1,9 +1,9 @@
 """
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-Risk and sliding estimates come from `SupplyMonitor`, which processes the recording as in flight,
-so that command and node agree.  They need no constant throttle, and have the monitor's limits.
-The risk is for the end of the recording; 0.1 or more above the highest throttle flown, it is NaN.
+Risk and sliding estimates need no constant throttle: `SupplyMonitor` computes them as in flight,
+so that command and node agree, and with the monitor's limits.  The risk is for the end of the
+recording; 0.1 or more above the highest throttle flown, it is NaN.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """
@@ -203,7 +203,7 @@ class ByThrottle:
     """Curves over throttle."""
 
     throttle: FloatArray  # 0, 0.1, .. 1; shape (k,)
-    # Whether that throttle was flown; if not, the risk is inter- or extrapolated; shape (k,).
+    # Whether each throttle was flown; if not, its risk is inter- or extrapolated; shape (k,).
     known: npt.NDArray[np.bool_]
     risk: FloatArray  # Probability of a brown-out within the horizon; NaN if unknown; shape (k,)
     budget: float  # Highest throttle that keeps the risk within `limit`; NaN if unknown

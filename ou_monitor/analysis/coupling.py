@@ -24,9 +24,9 @@ stamp error of e seconds gives a phase error of 2 pi f e.
   squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p), for
   any voltage, with K segments and p causes (throttle and its square) regressed out (Halliday et
   al., 1995).
-- This does not whiten moving lines and bursts.  So the second test compares the sum over bins and
-  the largest bin with their values when the signs of blocks of neighbouring segments are random
-  (Freedman and Lane, 1983).
+- The division does not whiten moving lines and bursts.  So the second test compares the sum over
+  bins and the largest bin with their values when the signs of blocks of neighbouring segments are
+  random (Freedman and Lane, 1983).
 
 Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
 in both series is detected although it is not coupling (`narrow`).
@@ -299,7 +299,7 @@ class Grid:
     """Series on one grid."""
 
     rate: float  # Rate of the grid, Hz
-    usable: float  # Highest frequency at which all series are unattenuated, Hz
+    usable: float  # Highest frequency at which no series is attenuated by more than 3 %, Hz
     # Parts without a gap in any series; each a tuple of the series, shape (n,).
     runs: list[tuple[FloatArray, ...]]
     rates: tuple[float, ...]  # Median rate of each series, Hz
@@ -422,7 +422,7 @@ class Coherence:
     p_value: float  # Family-wise, from two tests: the sum over bins and the largest bin
     squared: FloatArray  # Squared partial coherence, 0..1; shape (m,)
     response: ComplexArray  # Signal units per volt; shape (m,)
-    # Power of the voltage over the power of the unexplained signal, 1 / gain^2; shape (m,).
+    # Power of the voltage over the power of the unexplained signal, in 1 / gain^2; shape (m,).
     ratio: FloatArray
     threshold: float  # Coherence that the largest bin must exceed
     # Effective number of segments; that number less the fitted parameters.
@@ -546,7 +546,7 @@ def _power(signs: FloatArray, parts: ComplexArray) -> FloatArray:
 
 
 def _tail(drawn: FloatArray, law: str) -> float:
-    """Return the share of draws that reach the first; if few do, extrapolate by a fitted law."""
+    """Return the p-value of the first value: counted, or by a fitted law if few reach it."""
     reached = int((drawn >= drawn[0] * (1.0 - 1e-12)).sum())
     if reached > _COUNTED:
         return reached / drawn.size

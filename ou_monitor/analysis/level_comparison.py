@@ -2,10 +2,10 @@
 Compare load levels: the change of sigma, and whether alpha is constant.
 
 The paper assumes the same alpha at every load.  The test is chi^2 of ln(alpha) about the weighted
-mean.  The standard errors, proportional to 1/sqrt(alpha T), are computed with the common alpha:
-with its own alpha, a level whose alpha is high by chance would weigh too much.  Levels that one OU
-in white noise does not describe (more than one relaxation, or lines with impulses) are withheld,
-because their standard errors ignore the misfit.  Limits: only levels with a usable fit count; weak
+mean.  The standard errors, proportional to 1/sqrt(alpha T), are computed with the common alpha;
+otherwise, levels whose alpha is high by chance would weigh too much.  Levels that one OU in white
+noise does not describe (more than one relaxation, or lines with impulses) are withheld, because
+their standard errors ignore the misfit.  Limits: only levels with a usable fit count; weak
 lines stay in the fit; a test that does not reject proves nothing without the detectable ratio.
 
 The significance level is `LEVEL`, which matches the printed 95 % intervals.  Each level is fitted

@@ -212,7 +212,7 @@ class LevelSpectrum:
 
     frequency: FloatArray = field(default_factory=_empty)  # Even on a log axis, Hz; shape (k,)
     density: FloatArray = field(default_factory=_empty)  # Measured, V^2/Hz; shape (k,)
-    # Density of the fitted OU in white noise, sampled equally, V^2/Hz; NaN without; shape (k,).
+    # Density of the fitted OU in white noise at the same rate, V^2/Hz; NaN without; shape (k,).
     fitted: FloatArray = field(default_factory=_empty)
 
 
@@ -413,7 +413,7 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
             abs(line.frequency - other.frequency) < line.resolution + other.resolution
             for other in commanded)))
     shape = examine_level(_parts(still, within), estimate, left.above)
-    # Periodic impulses have spectral lines too, which are not subtracted.
+    # Do not subtract the lines of periodic impulses.
     kept = bool(lines.lines) and holm([shape])[0]['impulses'].rejects
     if lines.lines and not kept:
         clean = still.voltage.copy()
@@ -440,7 +440,7 @@ def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) 
 
 
 def _known_parts(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
-    """Return the parts of a segment in which the voltage is not NaN (it is near gaps)."""
+    """Return the parts of a segment in which the voltage is not NaN (near gaps, it is NaN)."""
     known = np.isfinite(voltage[segment.start:segment.stop])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start
     return [LevelSegment(a, b)

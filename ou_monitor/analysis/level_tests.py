@@ -90,7 +90,7 @@ class Shape:
     # Skewness and excess kurtosis of innovations divided by the standard deviation of their block.
     skewness: float
     kurtosis: float
-    impulses: int  # Innovations above the 99 % quantile of the largest of n normal ones
+    impulses: int  # Innovations beyond the 99 % quantile of the largest of n normal ones
     impulse_rate: tuple[float, float, float]  # Their rate, 1/s, and its 95 % interval (Poisson)
     # p-value of the test for AC coupling, Holm-adjusted over all levels; NaN if not tested.
     coupling_p: float = NAN

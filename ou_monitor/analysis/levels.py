@@ -114,7 +114,7 @@ def _is_long_enough(t: FloatArray, level: LoadLevel) -> bool:
     """Return whether a level has a long segment, or a shorter one and enough time in all."""
     whole = float(t[-1] - t[0])
     longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
-    # The limit is lower in short recordings.
+    # In short recordings, a quarter of the recording replaces `MIN_STAY`.
     return longest >= min(MIN_STAY, 0.25 * whole) and (
         longest >= LONG_STAY or _time_at(t, level) >= MIN_SHARE * whole)
 
@@ -178,7 +178,7 @@ def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
     time_at = np.bincount(where, weights=spent, minlength=bins)
     reach = int(round(width / _GRID))
     fine = np.convolve(time_at, _triangle(reach // 2), mode='same')
-    # The limit is lower in recordings of less than a second.
+    # In recordings of less than a second, a quarter of the recording replaces `MIN_TIME`.
     least = min(MIN_TIME, 0.25 * float(spent.sum()))
     found: list[int] = []
     while True:

@@ -29,7 +29,7 @@ THROTTLES = tuple(k / 10.0 for k in range(11))
 _PART, _IN_PART = 60.0, 200
 # Maximum shift of the current against the voltage, s.
 _LATE = 0.06
-# Maximum range of a steady throttle, and the time over which it is taken, s.
+# Maximum range of throttle that counts as steady, and the time over which the range is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
 # Maximum share of readings left out as outliers ("wild"); if more are far off, none is left out.
 _WILD = 0.01

@@ -259,7 +259,7 @@ def _is_same_file(first: Path, second: Path) -> bool:
 
 
 def _overwrites(target: Path, source: Path) -> bool:
-    """Return whether writing the target would harm the source: a file, or a bag's folder."""
+    """Return whether writing the target would harm the source (a file, or a bag's folder)."""
     if _is_same_file(target, source) or target.is_dir() and _real(target) in _real(source).parents:
         return True
     if not source.is_dir() or _real(source) not in _real(target).parents:

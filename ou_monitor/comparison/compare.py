@@ -1,5 +1,5 @@
 """
-Compare a recording with simulations over its own throttle.
+Compare a recording with simulations of it under the recorded throttle.
 
 Limits: the only input of the fitted model is throttle or current; the bands include errors of its
 parameters, estimated from held-out parts, but not later changes of the craft.

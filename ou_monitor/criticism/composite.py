@@ -43,7 +43,7 @@ class Composite:
     free: int  # Number of fitted parameters
     search: float  # Penalty for searched alternatives, nats
     events: Events | None = None  # Events from the laws, used in the Gaussian part
-    offset: FloatArray | None = None  # Offset from the laws, used likewise, V; shape (n,)
+    offset: FloatArray | None = None  # Offset from the laws, subtracted first, V; shape (n,)
     cost: float = 0.0  # Processor time of the fits, s, estimated from filters and laws
 
     def score(self, samples: Samples) -> float:

@@ -142,7 +142,7 @@ class _Run:
     segment: Segment
     kalman: Filter
     plain: FloatArray  # Predictive variances without the event at each sample, V^2; shape (n,)
-    full: FloatArray  # The same with it; shape (n,)
+    full: FloatArray  # Predictive variances with that event, V^2; shape (n,)
     cost: float  # Processor time, s
 
 

@@ -47,7 +47,7 @@ MOST = 8
 # residual of the response to throttle can halve the fitted alpha.
 MOST_COST = 10.0
 # Limit of a statistic: by theory, any of 70 exceeds it by chance in 1 of 2300 recordings; in
-# simulations, any did in 3 of 8700.
+# simulations, in 3 of 8700.
 FAILS = 4.8
 # Maximum share of its initial value that a statistic may keep: the form of a cause is never exact.
 OWN_SHARE = 0.07

@@ -100,7 +100,7 @@ class Fitter:
         return found
 
     def _fit_apart(self, found: Composite, part: slice) -> Composite:
-        """Alternate between the `APART` parameters of terms and all others while it gains."""
+        """Fit the `APART` parameters of terms and all others in turn while evidence grows."""
         for _ in range(_AGAIN):
             if not any(term.APART for term in found.terms):
                 break
