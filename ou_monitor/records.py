@@ -108,7 +108,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
 def _fine_unit(stamps: npt.NDArray[Any], masked: npt.NDArray[np.bool_] | np.bool_) -> str:
     """Return 'ms', 'us' or 'ns' if all stamps are dates since 1970 in that unit, else ''."""
     most = float(stamps.max(initial=0))
-    # If a stamp is NaN this is false, and the finite stamps are checked below.
+    # This is false if a stamp is NaN; the finite stamps are then checked below.
     if most <= MOST_STAMP:
         return ''
     known = stamps[np.isfinite(stamps) & ~masked]

@@ -499,7 +499,7 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
 
 
 def check_stamps(name: str, t: FloatArray, voltage: FloatArray) -> None:
-    """Refuse stamps too coarse for the voltage: dropping repeats would lose most readings."""
+    """Refuse stamps too coarse for the voltage: dropping repeated stamps loses most readings."""
     same = np.diff(t) == 0.0
     # Only changes count: a logger may repeat a reading together with its stamp.
     lost = np.count_nonzero(same & (np.abs(np.diff(voltage)) > 0.0))
@@ -507,7 +507,7 @@ def check_stamps(name: str, t: FloatArray, voltage: FloatArray) -> None:
         raise InputError(
             f'{name}: {lost} changes of the voltage have no stamp of their own, as '
             f'{counted(t.size)} share {counted(t.size - int(same.sum()), "stamp")}: give finer '
-            'stamps, or the interval of even samples (of a CSV: --sample-interval S)')
+            'stamps, or the interval of evenly spaced samples (of a CSV: --sample-interval S)')
 
 
 def hold(values: FloatArray) -> FloatArray:

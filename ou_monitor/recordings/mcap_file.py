@@ -4,8 +4,8 @@ Index one .mcap file with the MCAP library: topics, places of their messages, an
 The file is walked record by record.  Chunks that an intact summary lists are unpacked later, when
 their messages are read; all others (with `partial`, all chunks) are unpacked during the walk.
 Every stated size is compared with its limit before anything is read or unpacked.  The message
-indexes after a chunk are used only if they account for every byte of it.  Damage is reported by
-chunk.
+indexes after a chunk are used only if the messages that they list, with the chunk's other records,
+fill the chunk.  Damage is reported per chunk.
 https://mcap.dev/spec
 
 Limits: without checksums a wrong byte within a message is not detected.  A lost message is
@@ -424,7 +424,7 @@ class McapFile:
             data = self._data(file, span)
             self._unpacked += len(data)
             if self._unpacked > self._limit_of_all:
-                raise Damage(_over_limit('it and those before it hold', self._unpacked,
+                raise Damage(_over_limit('it and the chunks before it hold', self._unpacked,
                                          self._limit_of_all))
             table = self._messages(data)
         except Damage as error:

@@ -102,11 +102,11 @@ def _causes(finding: Finding) -> list[Part]:
         Text(GAIN),
         Notes.of([f'{row.label}: {row.explanation}' for row in found]),
         Text('The gain of a cause is the loss of held-out score when it is left out and the rest '
-             'is fitted again; its error combines the scatter of block means and the errors of '
-             'the parameters. p: twice the smaller of two p-values: the likelihood '
-             'ratio on the fitted part (corrected for the search) and the gain. "Exact" causes '
-             'are visible in the samples themselves; causes whose effect was removed from the '
-             'samples share one gain. Terms of one kind that share a gain are one row.',
+             'is fitted again; its error comes from the scatter of block means. p: twice the '
+             'smaller p-value of the likelihood ratio on the whole recording (corrected for the '
+             'search) and of the gain. "Exact" causes are visible in the samples themselves; '
+             'causes whose effect was removed from the samples share one gain. Terms of one kind '
+             'that share a gain are one row.',
              legend=True)]
 
 
@@ -175,7 +175,7 @@ def _under_load(finding: Finding) -> str:
     found = (f'Where {load} is {high} or more, the median voltage is '
              f'{number(sign * fall.measured, 2)} V {way} than where it is {low} or less (drift '
              f'included); the model gives {number(sign * fall.explained, 2)} V'
-             + ('.' if fall.fits else ': trust the readings.'))
+             + ('.' if fall.fits else '; trust the readings.'))
     if dips.count and dips.made is not None:
         made = (f'caused {dips.made} of the {dips.count} dips' if dips.count > 1 else
                 f'{"caused" if dips.made else "did not cause"} the only dip')

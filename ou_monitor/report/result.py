@@ -1,7 +1,7 @@
 """
 The result of a command in Python: record, JSON, table, plot, HTML.
 
-Limits: the table and the plots are the main ones of the command; `to_dict` has everything.
+Limits: `to_dataframe` and `plots` give the main results; `to_dict` gives all numbers.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class SourceClock:
         self._arrived = -math.inf
 
     def take(self, stamps: FloatArray, received: FloatArray, arrived: float) -> None:
-        """Register stamps and arrivals of samples, s; arrived: the last on the monotonic clock."""
+        """Register stamps and arrivals, s (arrived: the last arrival on the monotonic clock)."""
         newest = int(np.argmax(stamps))
         delay = float(received[newest] - stamps[newest])
         least = float(np.min(received - stamps))
@@ -118,7 +118,7 @@ class Publishers:
 
     def follow(self, numbers: list[int | None], times: FloatArray, arrived: FloatArray,
                publishers: int) -> npt.NDArray[np.bool_]:
-        """Return which messages (number, sending and arrival, s) are of the followed publisher."""
+        """Return which messages (numbers; times of sending and arrival, s) to keep."""
         kept = np.ones(len(numbers), dtype=np.bool_)
         if not numbers:
             return kept

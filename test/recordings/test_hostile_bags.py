@@ -188,7 +188,7 @@ BOMB = message(0, bytes(2**20 - 100), 1)
 @pytest.mark.parametrize('parts, words', [
     # Each chunk is within its limit; together they are out of proportion to the file.
     ([SOUND, chunk(BOMB, n=1, compression='zstd', packed=zstandard.compress(BOMB)) * 40],
-     'and those before it hold'),
+     'and the chunks before it hold'),
     ([SOUND, chunk(bytes(9 * 1_000_000), n=1)], 'in it are not messages'),
     ([chunk(SOUND), chunk(OTHER + messages(N))], 'defined a second time'),
     ([chunk(SOUND), OTHER], 'defined a second time'),
@@ -198,7 +198,7 @@ BOMB = message(0, bytes(2**20 - 100), 1)
       for encoding in (b'\x00\x07', b'\x00\x09', b'\x00\x02', b'\x01\x01')),
 ], ids=lambda value: value.replace(' ', '-') if isinstance(value, str) else '')
 def test_what_is_refused(tmp_path, monkeypatch, parts, words):
-    limit = 2**20 if words.startswith('and those') else 10_000_000
+    limit = 2**20 if words.startswith('and the chunks') else 10_000_000
     monkeypatch.setattr(mcap_file, '_chunk_limit', lambda size: limit)
     assert words in complaint(read_recording, by_hand(tmp_path / 'a.mcap', *parts), within=5.0)
 

@@ -77,7 +77,7 @@ _BLANK = re.compile("(?<=\\d)[\xa0\u2007\u2009\u202f'\u2019](?=\\d{3}(?!\\d))")
 _QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
-# Possessive, so that matching takes time proportional to the length of a line of blanks.
+# Possessive quantifiers: matching takes time proportional to the length of a line of blanks.
 _INTERVAL = re.compile(
     r'((?:sampl(?:e|ing)|time)[ _]*(?:interval|period)|sampl(?:e|ing)[ _]*time|'
     r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?[tx]|h_?resolution|'

@@ -608,7 +608,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
 
 def _series_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn,
                ) -> tuple[Form, int, int] | None:
-    """Return a form of the series that rows name, and the columns of names and values."""
+    """Return a form with a column per series that rows name, and where names and values are."""
     named = _choose(form, logs.VOLTAGE, time.place)
     if not form.line or not time.place or (
             named if wanted.voltage is None else _place_of(form, wanted.voltage) is not None):
