@@ -76,7 +76,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
 
 
 def loaded() -> None:
-    """From now on, do not end the process at once on a signal, because it has to clean up."""
+    """Mark that modules are loaded: a signal no longer ends the process without cleaning up."""
     _loading.clear()
 
 

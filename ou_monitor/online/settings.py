@@ -262,7 +262,7 @@ class FilterSettings:
     @classmethod
     def from_options(cls, options: Mapping[str, object],
                      base: FilterSettings | None = None) -> FilterSettings:
-        """Return settings with options changed; if not given, fallback moves into fmin..fmax."""
+        """Return settings with options changed; `fallback`, if omitted, moves into fmin..fmax."""
         values = _known(options, cls, 'filter option')
         old = base or cls()
         if 'fallback' not in values:

@@ -231,7 +231,7 @@ class ConstantReading:
         # The present run: readings, time in s, lowest and highest throttle (NaN: unknown).
         self._n, self._time = 0, 0.0
         self._throttle = (NAN, NAN)
-        # Smallest change, V, and longest run that ended by one ADC step, s.
+        # Smallest change, V, and longest run that ended with one ADC step, s.
         self._step, self._quiet = math.inf, 0.0
         self._at = NAN
 

@@ -2,7 +2,7 @@
 Find the bulk capacitance that brings the brown-out risk of a rail under a target.
 
 Limits: a linear network with Gaussian noise (see `ou_monitor.paper.network`), constant throttle,
-ideal capacitors of one series, no ageing, no cold.  The risk is the larger of two.  The first
+ideal capacitors of one series, no ageing or cold.  The risk is the larger of two risks.  The first
 comes from the exact mean first passage of an OU with the slowest excited pole and the variance of
 the rail; the second from the high-level crossing rate of the whole Gaussian process.  In
 simulations with levels at 2.5 and 3.2 standard deviations (extrapolated to a time step of 0), the
@@ -145,7 +145,7 @@ class Design:
     # With the smallest capacitance above which every capacitance meets the target; None: none.
     least: DesignRow | None
     doubled: DesignRow  # With twice the present capacitance.
-    rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
+    rows: tuple[DesignRow, ...]  # One row for each capacitance tried, rising.
     falls: bool  # Whether the risk never rises with capacitance in the table.
     # Battery resistance at which the mean of the bus is at the level, Ohm; NaN if there is none or
     # the rail is regulated.
@@ -477,8 +477,8 @@ class Flight:
     throttle: Sequence[float]  # 0..1, at which the next four fields are given
     sag: Sequence[float]  # V
     sag_se: Sequence[float]  # V
-    noise: Sequence[float]  # Rms as flown, V
-    steady: Sequence[float]  # Rms while throttle is constant, V
+    noise: Sequence[float]  # Rms of the noise in flight, V
+    steady: Sequence[float]  # Rms of the noise while throttle is constant, V
     flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
     resistance: float  # Sag after a second over the measured current, Ohm
     alpha: float  # Relaxation rate of the OU, 1/s

@@ -208,7 +208,7 @@ class Generator:
 
     @classmethod
     def telegraph(cls, up: float, down: float) -> Generator:
-        """Return two states, off (0) and on (1)."""
+        """Return the generator of a chain of two states, off (0) and on (1)."""
         return cls(np.array([[-up, up], [down, -down]]))
 
     @property

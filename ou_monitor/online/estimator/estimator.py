@@ -73,7 +73,7 @@ SLIDING = OU_WINDOWS[0]
 _SHARE, _SOONEST = 0.25, 1.0
 # Maximum share of one core for fits in the background.
 _CPU = 0.05
-# Statuses of an estimate without a relaxation whose window is too short for a fit.
+# Statuses of an estimate that has no relaxation because its window is too short.
 _SHORT = (Status.TOO_FEW_SAMPLES, Status.TOO_SHORT)
 # Cautions about the sliding estimate that do not apply to `RelaxationFits`.
 _SLIDING_ONLY = frozenset({Flag.TREND, Flag.SLOW_RATE})
@@ -440,7 +440,7 @@ class BlockAverager:
         return stamps[stamps >= since]
 
     def take(self, batch: Batch) -> tuple[FloatArray, bool]:
-        """Return stamps, voltage and throttle to keep; whether to discard the earlier ones."""
+        """Return stamps, voltage and throttle to keep, and whether to drop those kept before."""
         t = batch.t
         columns = batch.columns[:3]
         restart = False

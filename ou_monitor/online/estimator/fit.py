@@ -120,8 +120,8 @@ _STEP, _HAIR = 1e-4, 1e-3
 _GRID = (16, 8)
 # Minimum curvature in any direction, nats; maximum step.
 _FLAT, _LONGEST = 1e-3, 1.5
-# White noise relative to the diffusion of one step up to which z is linear in the noise (above it,
-# z is logarithmic); upper limit of z (for relative noise of 1e4, which hides any OU).
+# Ratio of white noise to the diffusion of one step, up to which z is linear in the noise (above
+# it, z is logarithmic); upper limit of z (for a ratio of 1e4, which hides any OU).
 _SMALL = 0.05
 _LOUDEST = math.log1p(1e4 / _SMALL)
 

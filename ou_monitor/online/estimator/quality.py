@@ -81,7 +81,7 @@ def _piles_up(y: FloatArray) -> bool:
     return False
 
 
-# Number of relaxation times in the window from which alpha is known to 25 % (doc/estimation.md).
+# Minimum number of relaxation times in the window for the status OK; with fewer, SHORT_WINDOW.
 GOOD_RELAXATIONS = 25.0
 # Alpha counts as buried in noise if the standard error of ln(alpha), before it is widened, exceeds
 # the first value, and also the second value times the error without noise (otherwise the short

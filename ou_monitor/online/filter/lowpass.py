@@ -32,7 +32,7 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 _TWO_PI = 2.0 * math.pi
-# Limits within which nothing overflows: maximum signal and stamp, s; minimum step, s.
+# Limits within which nothing overflows: maximum signal; maximum stamp, s; minimum step, s.
 LARGEST, LATEST, SHORTEST = 1e150, 1e18, 1e-12
 # Minimum length of a gap, in mean intervals; number of samples before gaps are counted.
 _GAP, _KNOWN = 5.0, 10

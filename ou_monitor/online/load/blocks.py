@@ -115,9 +115,9 @@ class LoadBlocks:
 DELAYS = (0.0, 0.05, 0.1, 0.15, 0.2)  # s
 # Changes slower than this, s, are removed, because they are discharge and recovery.
 _SLOW = 1.0
-# Share of the response that lags, and time constant of this lag, s, in the prior of the filter.
+# Prior of the filter: share of the response that lags, and time constant of the lag, s.
 _SHARE, _LAG = 1.0 / 3.0, 0.06
-# Minimum time compared, s, and memory, s.
+# Minimum time over which delays are compared, and memory of the comparison, s.
 _FIRST, _MEMORY = 10.0, 60.0
 # Another delay is adopted if its residual variance is below this share of the present delay's.
 _BETTER = 0.75
@@ -128,7 +128,7 @@ _LASTING = 3.0
 _PIECE, _PIECES_MEMORY, _FEWEST = 2.0, 120.0, 5.0
 # Minimum rms of the load in a segment that is used for this test.
 _MOVED = 0.01
-# Number of standard errors of a significant relation: one false alarm in 700 tests.
+# Number of standard errors from which a relation is significant: one false alarm in 700 tests.
 _SIGNIFICANT = 3.0
 # Maximum step between blocks, s, at which the delays can be distinguished.
 _LONGEST = 0.15

@@ -4,7 +4,7 @@ Level and resistance of a supply from its measured current, by a Kalman filter.
 Limits: scale and sign of the current are not corrected, so a wrong scale makes the resistance
 wrong.  A load that follows throttle but bypasses the current sensor makes the resistance too high:
 on a robot that draws 1 A, a further sag of 0.1 V at full throttle makes it 0.4 instead of 0.2 Ohm.
-The stated error includes this only if throttle clearly explains a part of the residual.  A
+The stated error includes this effect only if throttle clearly explains a part of the residual.  A
 constant current has no information.  (Throttle as a further regressor would absorb the other load,
 but on quads with slow current sensors also at least half of the resistance.)
 """
@@ -46,11 +46,11 @@ _LOUDEST = 0.7
 # Regression of current on throttle: memory, s; correlation time of the residuals, s; prior
 # standard deviation of the coefficients, in residuals.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
-# Time constants, s, of the band in which throttle is tried as a further regressor, and minimum
-# share of its variance that current leaves unexplained.  Smaller shares are due to rounding or lag
-# of the current (up to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x); shares of
-# 0.005 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and
-# regbot_28, 62 and 81.
+# Time constants, s, of the band in which throttle is tried as a further regressor; minimum share
+# of the throttle's variance that current must leave unexplained.  Smaller shares are due to
+# rounding or lag of the current (up to 0.0045 in simulated vehicles without a bypass, 5e-5 on
+# hebi_x); 0.005 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1,
+# and regbot_28, 62 and 81.
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
 # Exponents of throttle tried for that regressor: the median of the prior in `load_fit`, plus and
 # minus up to about two of its standard deviations.

@@ -32,8 +32,8 @@ _LAG = 0.004
 # Random walk of the level, V per sqrt(s) and cell: usual, as in an OU of 4.6 mV and 20 s (from the
 # batch fit); and for a nearly empty pack (chosen on bf_hiro_4s; 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
-# Distance of the level from `FastLevel`, if that predicts better, above which the level uses the
-# fast walk too, V per cell.  With 0.005, a sag that appears when motors are armed was learned
+# Distance between the level and a `FastLevel` that predicts better, V per cell, above which the
+# level uses the fast walk too.  With 0.005, a sag that appears when motors are armed was learned
 # late; with 0.01, a fall of the level was still taken for sag (simulated packs that empty in their
 # last 8 to 30 s).
 _BEHIND = 0.0075
@@ -76,8 +76,8 @@ class FastLevel:
     """A level that follows faster than the filter's level, for use while it predicts better."""
 
     def __init__(self) -> None:
-        # Stamp, s; level plus the fall by discharge, V; variance, V^2; that fall, V; time
-        # compared, s.
+        # Stamp, s; level as if nothing had been discharged, V, and its variance, V^2; fall by
+        # discharge, V; time compared, s.
         self._t = self._level = self._variance = NAN
         self._drawn = self._since = 0.0
         # Stamp, level of the filter, and faster level; mean squares of the errors of both, V^2.
@@ -241,7 +241,7 @@ class LoadFilter:
     def _begin(self, v: float, u: float) -> None:
         """Start a flight with the prior, scaled by the first voltage."""
         self._volts = max(v, 1e-3)
-        # Below 2.5 V it is not a lithium cell, so scale the curve of a cell.
+        # A supply below 2.5 V is not a lithium cell, so scale the curve of a cell.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
         start = self._start

@@ -137,7 +137,7 @@ class SupplyLoad:
             'load_delay': self.delay, 'load_basis': self.basis.name}
 
     def words(self, e: Estimate) -> str:
-        """Return sag, level, noise, and why alpha is unknown; empty unless in `_NO_ALPHA`."""
+        """Return sag, level, noise, and why alpha is unknown; '' if alpha may be known."""
         if math.isnan(self.level) or e.status not in _NO_ALPHA:
             return ''
         why = _NO_ALPHA[e.status].format(at=f' at {e.rate:.3g} Hz' if e.rate > 0.0 else '')

@@ -221,7 +221,7 @@ class FlightHistory:
         self._place(at[begin], rows, count)
 
     def _place(self, at: np.ndarray, rows: FloatArray, count: np.ndarray) -> None:
-        """Put rows at their places; fill gaps with the last values, or with NaN if too long."""
+        """Insert the rows of blocks `at`; fill short gaps with the last values, long ones: NaN."""
         old = self.table.shape[1]
         if at[0] < old:
             # Combine the first row with earlier samples of its block.

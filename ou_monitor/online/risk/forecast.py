@@ -63,8 +63,8 @@ MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Maximum initial width of the wider law, in widths of the law: chosen on gecko, nazgul, roma,
 # bf3s, erle and cf_solo (2 to 6 tried).
 _WIDEST = 4.0
-# Weight of the initial width in its average with the misses of this flight, in horizons (chosen on
-# gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
+# Weight of the wider law's initial width in its average with the misses of this flight, in
+# horizons (chosen on gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
 _FIRST = 4.0
 # Number of horizons that initially count as agreeing with the law for a given throttle: chosen on
 # the recordings of `_WIDEST`, hiro, cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9, 19 tried).
