@@ -83,9 +83,23 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
             shown = with_error(value, se.get(name), positive=term.positive(name))
             found.append(f'{term.label(name)} {shown}' if shown == VAGUE_NUMBER else
                          f'{term.label(name)} = {shown} {term.unit(name)}'.rstrip())
-    found += [f'factor over {name} = {curve_text(*curve)}' for name, curve in curves.items()]
+    found += [f'factor over {input_words(name)} = {curve_text(*curve)}'
+              for name, curve in curves.items()]
     return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '
                                  'plot and --json'] if long else [])])
+
+
+# Inputs of curves in words, by the first word of their name in `Term.factors`.
+_INPUTS = {'fast': 'distance of throttle from its mean over', 'step': 'change of throttle',
+           'slow': 'distance of smoothed throttle from its mean over',
+           'rises': 'rise of throttle within', 'falls': 'fall of throttle within',
+           'product': 'product of these factors'}
+
+
+def input_words(name: str) -> str:
+    """Return the input of a curve in words."""
+    first, *span = name.split()
+    return ' '.join([_INPUTS.get(first, first), *span])
 
 
 def curve_text(at: Sequence[float], factors: Sequence[float]) -> str:

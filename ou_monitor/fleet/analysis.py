@@ -36,7 +36,7 @@ class Options:
     cells: int = 0  # Cells in series; 0: from the log, else a guess
     # Arguments of `read_recording`.
     msg_config: str | None = None
-    msg_config_hash: str = ''  # Hash of that file; if it changes, recordings are analysed again
+    msg_config_hash: str = ''  # Of the file; if it changes, the recordings are analysed again
     voltage_topic: str | None = None
     throttle_topic: str | None = None
     columns: CsvColumns | None = None

@@ -30,8 +30,7 @@ _COMMON = ('', '.log', '.txt')
 _CSV = '.csv file', 'without columns of time and voltage'
 _LOG = 'file', 'with the ending of a log, but in no known format'
 _BLOCK = 1 << 20  # Bytes read at once for the digest
-# Maximum depth of the folders searched.
-_MOST_DEPTH = 50
+_MOST_DEPTH = 50  # Maximum depth of the folders searched
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,8 @@ class Values:
     paths: tuple[str, ...]  # Recordings
     vehicles: tuple[str, ...]  # Vehicle of each; empty where unknown
     flights: IntArray  # Number of the flight; 0 where unknown; shape (n,)
-    # Logarithm at the reference throttle (sag: at full throttle), and its standard error with the
-    # error of the move; shape (n,).
+    # Logarithm at the reference throttle (sag: at full throttle), and its standard error, which
+    # includes the error of the move; shape (n,).
     value: FloatArray
     error: FloatArray
     curve: CommonCurve  # Curve that was subtracted
@@ -104,7 +104,7 @@ class Values:
         return self.shown(self.value - reach), self.shown(self.value + reach)
 
     def common_curve(self, throttle: FloatArray) -> FloatArray:
-        """Return the common curve through the median of all, in the unit of the quantity."""
+        """Return the common curve through the median of all values, in the quantity's unit."""
         return self.shown(float(np.median(self.value)) + self.curve(throttle))
 
 
@@ -256,8 +256,7 @@ def _knots(u: FloatArray) -> list[float]:
 
 # Minimum number of flights to test for drift: the line through two flights leaves no scatter.
 LEAST_FLIGHTS = 3
-# A mean month, s; no change per month is computed if all flights are within one month.
-_MONTH = 365.25 / 12.0 * 86400.0
+_MONTH = 365.25 / 12.0 * 86400.0  # A mean month, s
 
 
 @dataclass(frozen=True)
@@ -276,7 +275,8 @@ class Trend:
     first: int
     last: int
     p_value: float  # Of this test alone
-    # Change of the logarithm per month, and its 95 % interval; NaN where a date is unknown.
+    # Change of the logarithm per month, and its 95 % interval; NaN if a date is unknown, or if all
+    # flights are within one month.
     monthly: tuple[float, float, float] = (NAN, NAN, NAN)
     p_family: float = NAN  # After Holm, over all tests of the fleet
 
@@ -415,7 +415,7 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
 
 def _centred(value: FloatArray, members: Sequence[npt.NDArray[np.intp]]
              ) -> tuple[FloatArray, FloatArray]:
-    """Return rows without the medians of their groups, and the medians; shape (k, n)."""
+    """Return values (k, n) less the medians of their groups, scaled, and the medians."""
     middle = np.empty_like(value)
     wide = np.empty(value.shape[1])
     for index in members:
@@ -433,8 +433,8 @@ def _spread(scatter: FloatArray, error: FloatArray) -> FloatArray:
 def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatArray:
     """Return s of each row; shape (k, 1)."""
     # The median of |rest| / sqrt(s^2 + se^2) is `_MEDIAN`, as for a normal distribution, if s^2 is
-    # the median of rest^2 / `_MEDIAN`^2 - se^2. A share of 0.5 + z / (2 sqrt(n)) gives an upper
-    # bound of one-sided level Phi(z).
+    # the median of rest^2 / `_MEDIAN`^2 - se^2. The quantile at 0.5 + z / (2 sqrt(n)) gives an
+    # upper bound of one-sided level Phi(z).
     excess = (rest / _MEDIAN) ** 2 - error[None, :] ** 2
     return np.sqrt(np.maximum(np.quantile(excess, share, axis=1)[:, None], 0.0))
 
@@ -521,7 +521,7 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
 
 def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int
                       ) -> VehicleValues:
-    """Compare vehicles (flat: values without drift); packs only with equal numbers of cells."""
+    """Compare vehicles (flat: values without drift); packs only with packs of equal cells."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))

@@ -24,8 +24,7 @@ METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
 # A date in a name, with the time if it follows: 2024-05-03_14-07-12, 20240503T140712.
 _DATE = re.compile(r'(?<!\d)(20\d\d)(?:([-_.])(\d\d?)\2(\d\d?)|(\d\d)(\d\d))(?:[T _-]+(\d\d)'
                    r'[-_:.h]?(\d\d)(?:[-_:.m]?(\d\d))?)?(?!\d)')
-# Maximum paths or vehicles named in a note.
-_SHOWN = 3
+_SHOWN = 3  # Maximum paths or vehicles named in a note
 
 
 @dataclass(frozen=True)

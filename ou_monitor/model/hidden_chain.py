@@ -27,7 +27,7 @@ _NONE = 1e-300
 def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
             ) -> tuple[FloatArray, FloatArray]:
     """Return the state probabilities before each sample, and the log density of each sample."""
-    # log_density: of a sample given the state before it and the state at it, shape (n, k, k).
+    # log_density: of each sample, given the previous and the present state, shape (n, k, k).
     n, k, _ = log_density.shape
     top, padded = _in_blocks(log_density, transition)
     size, blocks = padded.shape[0], padded.shape[3]

@@ -71,7 +71,7 @@ def charge_at(cell: float) -> float:
 
 
 def cells_in_series(voltage: float) -> int:
-    """Return the smallest number of cells that can have that voltage, V."""
+    """Return the smallest number of cells that can have a voltage, V."""
     return max(1, int(np.ceil(voltage / FULL_CELL)))
 
 
@@ -217,7 +217,7 @@ class LoadStart:
         if not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * float(np.abs(P.diagonal()).max())):
             raise ValueError('the covariance of the load must be symmetric')
         if np.linalg.eigvalsh(P)[0] < -1e-9 * float(P.diagonal().max()):
-            raise ValueError('the covariance of the load must not be negative')
+            raise ValueError('the covariance of the load must have no negative eigenvalue')
         if not (self.cells > 0.0 and self.volts > 0.0 and min(positive) >= 0.0
                 and 0.0 <= self.flown[0] <= self.flown[1] <= 1.0 and 0.0 <= self.delay <= 1.0):
             raise ValueError('the load needs cells and volts above 0, discharge, resistance '

@@ -45,7 +45,8 @@ from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS
 # Minimum evidence for a relaxation over white noise alone, nats: more than white noise reached in
 # any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
-# Distance of the level's knots, s, at 1 Hz or faster; minimum readings per knot; minimum parts.
+# Distance of the level's knots, s, at 1 Hz or faster; minimum readings per knot; minimum number of
+# spans between knots.
 _HATS, _PER_KNOT, _PARTS = 5.0, 5, 3
 # Lags, s, of throttle and current: from an ESC to polarisation.
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
@@ -53,7 +54,7 @@ _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 _DELAYS, _DELAY_READINGS = 4, 8000
 # Maximum shift of a current, samples, even if `reach` allows more.
 _FAR = 20
-# Minimum range of a throttle that moves.
+# Minimum range of a load that moves, relative to its maximum or 1, whichever is larger.
 _MOVED = 0.01
 # Minimum gap, in median steps: splitting the data at smaller gaps would cost more accuracy than
 # ignoring them.  Minimum number of readings between gaps.
@@ -64,8 +65,7 @@ _HELD = 0.8
 # Selecting by the visibility of the relaxation instead would bias alpha, because in a short window
 # visibility depends on the error of alpha.
 PRECISE = 1.5
-# Minimum number of readings beyond the number of regressors.
-FEWEST = 40
+FEWEST = 40  # Minimum number of readings beyond the number of regressors
 # Maximum number of elements in an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
 # Number of points of the first grid in ln(alpha dt), logit(share of the OU) and ln(walk); ends of
@@ -89,8 +89,8 @@ _REFINED, _RIVAL = 10.0, 6.0
 # A window is imprecise above this standard deviation of ln(alpha) (from the curvature at the
 # maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.
 _IMPRECISE = 0.37
-# Usual walk of the level, V per sqrt(s) and cell; above it, prior standard deviation of its
-# logarithm.  Walks of .0015 to .015 fit the recordings.
+# Usual walk of the level, V per sqrt(s) and cell; prior standard deviation of ln(walk) above the
+# usual walk.  Walks of .0015 to .015 fit the recordings.
 _WALK, _WALK_SD = 0.004, 0.8
 # Maximum alpha dt: beyond it, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
@@ -105,8 +105,7 @@ _QUARTER = 0.25
 _SPANNED = 1e-5
 # Minimum periods of a line between knots of the level, which absorbs slower lines.
 _PERIODS = 10.0
-# Exponent of the load over throttle.
-_POWER = 1.8
+_POWER = 1.8  # Exponent of the load over throttle
 
 
 def usual_walk(v: FloatArray) -> float:

@@ -71,7 +71,7 @@ class SupplyModel:
         for term in self.terms:
             count = names.count(term.NAME)
             if count > 1 and not term.SEVERAL:
-                raise ValueError(f"a model can have one term '{term.NAME}', got {count}")
+                raise ValueError(f"a model can have only one term '{term.NAME}', got {count}")
 
     @property
     def ou(self) -> OU:

@@ -192,9 +192,9 @@ class CrossSpectrum:
 
     def cost(self, S: FloatArray, used: int | None = None
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return minus the restricted log-likelihood of spectra, shape (k, bins), and more."""
-        # Results: the cost, minimised over a factor on each spectrum, shape (k,); the factors; the
-        # products x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
+        """Return minus the restricted log-likelihood of spectra (k, bins), factors, products."""
+        # The likelihood is maximised over a factor on each spectrum, shape (k,).  The products are
+        # x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
         # Keep the matrices positive definite despite rounding.
         gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10

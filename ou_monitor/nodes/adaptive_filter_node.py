@@ -399,7 +399,7 @@ class AdaptiveFilterNode(MonitorNode):
 
 def _unknown(supply: SupplyEstimate) -> str:
     """Return why sigma is unknown, as a clause."""
-    return supply.why or 'sigma was not known at the last message'
+    return supply.why or 'sigma was unknown at the last message'
 
 
 def _filter_options(values: Mapping[str, Any]) -> dict[str, Any]:

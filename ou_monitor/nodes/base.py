@@ -174,7 +174,7 @@ class MonitorNode(Node):
             self.publish_every(self._outputs_callback)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Call back every `period` s of real time, even on simulated time, to detect silence."""
+        """Call back every `period` s of real time, so that silence of `/clock` is detected too."""
         timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
         self._made.append(timer)
         return timer
@@ -346,7 +346,7 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
 
 
 def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
-    """Return the unconfigured managed version of a kind of node (design.ros2.org)."""
+    """Return a class of managed nodes from a class of nodes (design.ros2.org)."""
     # Before the node is active, it has only parameters and lifecycle services.  If an InputError
     # refuses a transition, the node stays in its former state.
     class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]

@@ -49,8 +49,7 @@ HAND_OVER = 0.25
 SHARE = 0.25
 # CPU time of an estimate, s, above which it is not repeated for every report.
 HEAVY = 0.02
-# Maximum factor by which samples are thinned.
-MOST_THIN = 1024
+MOST_THIN = 1024  # Maximum factor by which samples are thinned
 # Maximum number of throttle messages that are placed among the voltages in one transfer; of more,
 # an even selection is used.
 MOST_THROTTLES = 100
@@ -58,8 +57,7 @@ STATE_FILE = Parameter(
     'state_file', '',
     'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
     "after the node; relative: under ROS's log directory); empty: off.")
-# Throttle above which the craft may be in flight.
-LANDED = 0.05
+LANDED = 0.05  # Throttle above which the craft may be in flight
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 
 
@@ -88,8 +86,8 @@ class EstimatorNode(MonitorNode):
         self._watched = PublisherWatch(self)
         self._settled = 0
         self._console = Console(self)
-        # Times at which the next estimate is due, and at which outputs were last published, s;
-        # below: CPU time of pushing samples, s, and the time since which it is counted.
+        # Times, s, at which the next estimate is due, and at which outputs and diagnostics were
+        # last published; below: CPU time of pushing samples, s, and since when it is counted.
         self._due = self._published = self._diagnosed = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
         self._handed_over = -math.inf
@@ -313,7 +311,7 @@ class EstimatorNode(MonitorNode):
         report = self._monitor.report(
             self._source_clock.age(now), now, self._usable.age, again=again)
         if again:
-            # At 10 Hz, an estimate of 1 ms costs little; one of 100 ms delays the next one.
+            # At 10 Hz, an estimate of 1 ms costs little; after 100 ms, the next one must wait.
             took = time.thread_time() - begin
             self._due = now + (took / SHARE if took > HEAVY else 0.0)
         self._console.flag(report.flag)

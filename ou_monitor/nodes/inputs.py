@@ -96,7 +96,7 @@ class Stamper:
         return self._map(source) if self.simulated else source
 
     def time_of(self, stamp: float, info: Any) -> float:
-        """Return a header's stamp, s; the source time where it is 0 or missing."""
+        """Return a header's stamp, s, or the source time if the stamp is 0 or missing."""
         return stamp or self.source_time(float(info['source_timestamp']) * 1e-9)
 
     def _clock(self, message: Any, info: Any) -> None:

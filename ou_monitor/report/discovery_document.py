@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.words import (
-    both_names, by_load, cause_rows, curve_text, GAIN, gain_text, parameters,
+    both_names, by_load, cause_rows, curve_text, GAIN, gain_text, input_words, parameters,
     plain_words, with_error)
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 from ou_monitor.model.terms.term import Role
@@ -217,7 +217,8 @@ def _parameters(finding: Finding) -> list[Part]:
     assert finding.model is not None
     for term, se in zip(finding.model.terms, finding.se):
         curves = term.factors()
-        rows += [[term.NAME, f'factor over {name}', curve_text(*curve), '-', 'factor on the noise']
+        rows += [[term.NAME, f'factor over {name}', curve_text(*curve), '-',
+                  by_load(f'factor on the noise over {input_words(name)}', finding.load)]
                  for name, curve in curves.items()]
         for spec in fields(term):
             value = getattr(term, spec.name)

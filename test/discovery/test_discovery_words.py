@@ -6,7 +6,7 @@ import re
 
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.words import (
-    both_names, cause_rows, coupling_note, explain, gain_text, gain_words,
+    both_names, cause_rows, coupling_note, explain, gain_text, gain_words, input_words,
     parameters, plain, PLAIN_NAMES, plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise
@@ -154,7 +154,7 @@ def test_every_cause_has_its_words(name):
     assert len(text) > 120 and 'To separate them' in text and '(for drift)' in text
     told = [p for p in kind.parameters() if not (term.factors() and isinstance(values[p], list))]
     assert all(f'{kind.label(p)} = ' in text for p in told)
-    assert all(f'factor over {name} = ' in text for name in term.factors())
+    assert all(f'factor over {input_words(name)} = ' in text for name in term.factors())
 
 
 @pytest.mark.parametrize('index, what, when', [

@@ -11,8 +11,7 @@ from ou_monitor.model.terms.laws import View
 from ou_monitor.records import FloatArray, NAN
 from scipy.signal import welch
 
-# Number of candidate lines examined.
-_MOST = 3
+_MOST = 3  # Number of candidate lines examined
 
 
 def phase_noise(linewidth: float, rng: np.random.Generator
@@ -59,9 +58,9 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
 _FINE, _ENOUGH = 4.0, 12
 # Limits of `power_spread`.  Above CONSTANT, a peak is not a line of constant amplitude; below
 # RINGING, it is not ringing.  Between 0.7 and 0.85 it can be either, and the evidence decides.
-# Simulations of 60 lines and 60 ringings, with outliers: with 14 segments, 60 lines and 10
-# ringings were below CONSTANT, and 2 lines and 54 ringings above RINGING; with 33 segments, 60
-# lines and 2 ringings were below CONSTANT, and 0 lines and 60 ringings above RINGING.
+# Of 60 lines and 60 ringings, simulated with outliers:
+# 14 segments: 60 lines and 10 ringings below CONSTANT, 2 lines and 54 ringings above RINGING;
+# 33 segments: 60 lines and 2 ringings below CONSTANT, 0 lines and 60 ringings above RINGING.
 CONSTANT, RINGING = 0.85, 0.7
 
 

@@ -387,12 +387,8 @@ def _square_correlation(square: FloatArray) -> float:
 # Maximum number of samples in a fit; maximum fourth moment that jitter can cause; maximum
 # correlation of neighbouring squares, in standard errors.
 _SHORT, _MOST_KURTOSIS, _MOST_CORRELATION = 15000, 6.0, 4.0
-# Number of discrete values of a stamp's error.
-_LEVELS = 7
-
-
-# Minimum distance of phi from 0 and 1.
-_LEAST_JITTER = 1e-12
+_LEVELS = 7  # Number of discrete values of a stamp's error
+_LEAST_JITTER = 1e-12  # Minimum distance of phi from 0 and 1
 
 
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray

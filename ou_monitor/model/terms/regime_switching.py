@@ -228,7 +228,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> St
 
 
 def _with_less_noise(view: View, share: float) -> View:
-    """Return the view for an OU with a share of the noise, and the same white noise."""
+    """Return the view for an OU with a share of its noise, and the same white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
@@ -622,18 +622,13 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
 
 # Factors by which the rail may relax faster than in a fit without levels.
 _FASTER = 1.0, 3.0, 9.0
-# Minimum evidence for slow levels, nats.
-_SLOW_AHEAD = 8.0
+_SLOW_AHEAD = 8.0  # Minimum evidence for slow levels, nats
 # Number of samples for comparing starts, and for fitting from the best start.
 _SHORT, _LONG = 8000, 30000
-# Maximum rate of switching, 1/s.
-_FASTEST = 30.0
-# Minimum number of changes in the fitted part.
-_CHANGES = 8.0
-# Minimum evidence for three states, nats.
-_THIRD = 10.0
-# |ln ratio| below which the ratio counts as 1.
-_NO_RATIO = 0.05
+_FASTEST = 30.0  # Maximum rate of switching, 1/s
+_CHANGES = 8.0  # Minimum expected number of changes in the fitted part
+_THIRD = 10.0  # Minimum evidence for three states, nats
+_NO_RATIO = 0.05  # |ln(ratio of sigmas)| below which the sigmas count as equal
 
 
 def _fastest(view: View) -> float:

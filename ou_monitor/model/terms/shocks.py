@@ -16,8 +16,7 @@ from ou_monitor.records import FloatArray
 from scipy.special import gammainccinv, gammaincinv, ndtr
 
 
-# Minimum denominator.
-_TINY = 1e-280
+_TINY = 1e-280  # Minimum denominator
 # Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
 # Maximum share of samples with a jump; with more, jumps are not rare events.

@@ -123,8 +123,7 @@ _MOST, _PROPOSED = 3, 0.5
 # geometric mean of this and the maximum.  A line wider than WIDEST, Hz, must have a constant
 # amplitude; otherwise it is ringing.
 _WANDERS, WIDEST = 3.0, 2.0
-# Maximum width of a line relative to its frequency.
-SHARP = 0.05
+SHARP = 0.05  # Maximum width of a line relative to its frequency
 
 
 @dataclass(frozen=True)
@@ -296,5 +295,4 @@ class ThrottleTone(Term):
 _MOVES = 30.0
 # Minimum change of a line's frequency by one standard deviation of throttle, in linewidths.
 _MORE = 1.0
-# Minimum linewidth of the two states, Hz.
-_NARROWEST = 1e-4
+_NARROWEST = 1e-4  # Minimum linewidth of the two states, Hz
