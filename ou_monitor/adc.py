@@ -304,7 +304,7 @@ class IioBuffer:
         path = self._folder / 'current_timestamp_clock'
         name = read_attribute(path) if path.exists() else 'realtime'
         if name not in _CLOCKS:
-            raise InputError(f"{path} is '{name}': one of {', '.join(_CLOCKS)} can be used")
+            raise InputError(f"{path} is '{name}': only {', '.join(_CLOCKS)} can be used")
         return _CLOCKS[name]
 
     def _open(self) -> int:

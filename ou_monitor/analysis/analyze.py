@@ -120,8 +120,8 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
         return ('The recording has no throttle: it is taken as one load level.',
                 *([switches] if switches else []))
     if any(math.isnan(level.throttle) for level in found):
-        return ('No throttle was held long enough for a load level: the whole recording is one '
-                'level, with throttle as a regressor; --levels can name levels.',)
+        return ('No throttle was held long enough for a load level: the whole recording is taken '
+                'as one level, without its response to throttle. --levels can name levels.',)
     step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
     held = sum(float(recording.t[s.stop - 1] - recording.t[s.start]) + step
                for level in found for s in level.segments)

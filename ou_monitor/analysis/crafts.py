@@ -65,8 +65,7 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
             'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
             'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),
             'frc_ol_1': (3, NAN, NAN, 0.0275)}}
-# Maximum number of cells of a known quad.  Larger packs are not compared: a 24 V pack of a robot
-# looks like 7 cells.
+# Maximum number of cells of a known quad; more are not compared: 24 V robots look like 7 cells.
 _MOST_CELLS = max(cells for cells, *_ in KNOWN[QUAD].values())
 # Cells of the class of robots, and formats that do not show the kind of vehicle.
 _ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')

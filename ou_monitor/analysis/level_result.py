@@ -52,8 +52,7 @@ from scipy import stats
 from scipy.signal import welch
 
 
-# Excess kurtosis that the tests must be able to detect, with power `_POWER`, before a level is
-# named Gaussian or a diffusion.
+# Excess kurtosis that the tests must be able to detect (power `_POWER`) to name a level Gaussian.
 VISIBLE_KURTOSIS = 1.0
 _POWER = 0.9
 # Maximum share of spectral lines in the variance of a level named a diffusion.

@@ -197,7 +197,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                          if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little or too seldom, or a '
-                      'load seems to bypass its sensor'))
+                      'load seems to bypass the current sensor'))
     lines.append(('Relaxation', _ou_words(found.facts.ou, found.whole)))
     if found.line is not None:
         line = found.line
@@ -285,4 +285,4 @@ def _ou_words(ou: OuFacts, whole: OuFacts | None = None) -> str:
         return (f'not visible in {window}: faster than '
                 f'{number(1e3 * ou.tau_below_s)} ms, or below '
                 f'{number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
-    return 'unknown: the recording is too short for it'
+    return 'unknown: the recording is too short'

@@ -131,9 +131,8 @@ def _unit_items(recording: Recording) -> list[QualityItem]:
     if low < -_TRIM or high > 1.0 + _TRIM:
         items.append(QualityItem('THROTTLE_RANGE', Severity.WARNING, (
             f'Throttle runs from {low:.3g} to {high:.3g} instead of 0 to 1: curves, risk and '
-            'throttle budget only cover 0 to 1. Check '
-            'the sign; use (x + 1) / 2 for a stick from -1 to 1, and the absolute value for '
-            'reverse thrust.')))
+            'throttle budget cover only 0 to 1. Check the sign; use (x + 1) / 2 for a stick from '
+            '-1 to 1, and the absolute value for reverse thrust.')))
     return items
 
 

@@ -355,8 +355,7 @@ _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
-    'power network, for a range of bulk capacitances; find the smallest that keeps the risk below '
-    '--risk.',
+    'power network, for a range of bulk capacitances; find the smallest with a risk below --risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a recording; --set overrides its '
             'values (--set cells=0: the recording is of a rail, not of a pack)'),

@@ -400,7 +400,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
     pooled = np.mean([m.distribution for m in (own, *others)], axis=0)
     found.append(Difference(
         'ks', distance(own, pooled), of(lambda m: distance(m, pooled)), _KS, lambda b: (
-            f'the shares of time at each voltage differ by up to {number(b.measured, 2)} '
+            f'the share of time below a voltage differs by up to {number(b.measured, 2)} '
             f'(simulations among themselves: {_span(b, 2)})')))
     return found
 

@@ -203,8 +203,7 @@ _FEWEST_TIES, _FINE = 20, 0.15
 _APART, _PERIODS = (2, 4, 8), range(9, 101)
 # Maximum ratio of a rail's noise to its noise at rest, and hence of the probabilities of a tie.
 _CALMEST = 100.0
-# Minimum excess of ties, and maximum deficit in size of the changes at ends of runs, both in
-# standard errors.
+# Minimum excess of ties, and maximum deficit in size of changes that end runs, standard errors.
 _CLEARLY, _SHORT = 6.0, 3.0
 # Share of the readings at either end of the range; their runs may come from clipping.
 _END = 0.1

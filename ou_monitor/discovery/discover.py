@@ -87,9 +87,8 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
             raise
-        return _insufficient(recording, state, 'No OU can be fitted to it and simulated: hardly '
-                             'any of its samples differ, or some are far from all others.',
-                             seed)
+        return _insufficient(recording, state, 'No OU can be fitted and simulated: hardly any '
+                             'samples differ, or some are far from all others.', seed)
     done(0.6)
     scored = covered(samples)
     uncovered = samples.n - int(scored.sum())
@@ -148,7 +147,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration,
-        verdict=Verdict.INSUFFICIENT_DATA, words=('Nothing can be said about it.', reason),
+        verdict=Verdict.INSUFFICIENT_DATA, words=('This recording cannot be judged.', reason),
         notes=state.notes, has_throttle=recording.has_throttle, seed=seed)
 
 

@@ -82,8 +82,7 @@ def load_fall(samples: Samples, terms: Sequence[Term]) -> LoadFall:
     mean, ends = _path(samples, responses), (u <= low, u >= high)
     measured, explained = (float(np.median(y[ends[0]]) - np.median(y[ends[1]]))
                            for y in (v, mean))
-    # Readings of one stay at a load are not independent: count stays.  Add the rounding of both
-    # medians to ADC codes.
+    # Stays at a load are independent, their readings are not; both medians are rounded to codes.
     stays = [1 + int((end[1:] & ~end[:-1])[1:].sum()) for end in ends]
     error = math.hypot(float(np.std(v - mean)) * math.sqrt(sum(1.0 / count for count in stays)),
                        find_step(v) / math.sqrt(6.0))
