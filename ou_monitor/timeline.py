@@ -330,10 +330,10 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     """
     Return a recording without wild readings and without the times when its supply was off.
 
-    Notes report both.  A supply is off below `OFF` of its usual voltage; the outage includes
-    adjacent readings below `_ON`.  If the supply is low too often, or mostly between `OFF` and
-    `_ON`, all readings are kept.
-    at_ends: leave out only the start and the end of the recording.
+    Notes report what was left out.  A supply is off below `OFF` of its usual voltage; the outage
+    includes adjacent readings below `_ON`.  If the supply is low too often, or mostly between
+    `OFF` and `_ON`, all readings are kept.
+    at_ends: leave out only outages at the start and the end of the recording.
     """
     usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
     wild = recording.voltage > WILD_FACTOR * usual
@@ -395,8 +395,8 @@ def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
         return t
     usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Leave the stamps if the voltage changes only where the stamp does (repeated rows), or always
-    # in one direction where it does (several series in turn).
+    # Leave the stamps if the voltage changes only at new stamps (repeated rows), or if it always
+    # changes in one direction there (several series in turn).
     if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
             first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
                 np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
@@ -662,7 +662,7 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
 
 
 def back_words(t: FloatArray) -> str:
-    """Return a note if the clock went back by a stretch (t in s), else ''."""
+    """Return a note if the clock went back over many samples (t in s), else ''."""
     steps = int(np.count_nonzero(np.diff(t) < 0.0))
     ahead = np.maximum.accumulate(t) - t
     behind = int(np.count_nonzero(ahead))

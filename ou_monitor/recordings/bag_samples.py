@@ -1,7 +1,7 @@
 """
 The voltage samples of a bag with their throttle and current.
 
-A msg config fits if a topic of its type has its name, or ends with it (in a namespace). A generic
+A msg config fits if the bag has its topic, possibly in a namespace, with its type. A generic
 config also fits if exactly one topic has its type. If several configs fit, the user must choose.
 Limits: all samples of a bag are held in memory, 150 MB for an hour at 1 kHz.
 """

@@ -232,7 +232,7 @@ class McapFile:
             return {}
         spans: dict[int, Span] = {}
         # Chunks without messages have no index; files written without any index do not say which
-        # chunks those are.
+        # chunks are empty.
         indexed = any(index.message_index_offsets for index in summary.chunk_indexes)
         for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
             if index.chunk_start_offset < end or index.chunk_length < _HEAD.size:

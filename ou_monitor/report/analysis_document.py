@@ -179,7 +179,7 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
 
 
-# Ratio of the relaxation's rms to the median noise at steady throttle above which both are
+# Ratio of the relaxation's rms to the median noise at steady throttle, above which both values are
 # reported.
 _MIXED = 1.2
 

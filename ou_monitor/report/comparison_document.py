@@ -97,7 +97,7 @@ def _since_start(found: Agreement) -> tuple[FloatArray, float]:
 def _voltage(found: Agreement) -> Plot:
     at = found.traces
     plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300)
-    # Since the first sample, as on the other pages: stamps may be dates.
+    # Count from the first sample, as on other pages: stamps may be dates.
     t, begin = _since_start(found)
     plot.band(at.at - begin, at.low, at.high, 'simulated, 95 %', _SIMULATED)
     plot.line(t, at.simulated, 'one simulation', _SIMULATED, 'faint')

@@ -78,7 +78,7 @@ class Result:
         return getattr(self.record, name)
 
     def __dir__(self) -> list[str]:
-        """Return the names of all attributes, those of the record included."""
+        """Return the names of all attributes, including the record's."""
         return sorted({*super().__dir__(), *dir(self.record)})
 
     @property

@@ -230,7 +230,7 @@ class Plot:
 
     def limits(self, x: tuple[float, float] | None = None,
                y: tuple[float, float] | None = None) -> Plot:
-        """Set the ends of an axis; otherwise they follow the data."""
+        """Set the ends of an axis; ends that are not set follow the data."""
         self._x_range = x or self._x_range
         self._y_range = y or self._y_range
         return self

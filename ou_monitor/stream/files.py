@@ -182,7 +182,7 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
-        """Construct a node; refuse numbers of too many digits and impossible values."""
+        """Construct a node; refuse numbers with too many digits, and impossible values."""
         if isinstance(node, yaml.ScalarNode) and len(node.value) > MOST_DIGITS and (
                 node.tag in ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')):
             self._refuse(f'a number has more than {MOST_DIGITS} digits', node)

@@ -108,7 +108,7 @@ class Publishers:
     Follows the first of several publishers of one topic, and counts its lost messages.
 
     `lost`: messages missing from its sequence numbers; `foreign`: messages of others; `numbered`:
-    whether the middleware numbers messages (if not, both are unknown).
+    whether the middleware numbers messages (if not, both counts are unknown).
     """
 
     def __init__(self) -> None:
@@ -271,9 +271,9 @@ class ThrottleHold:
         """
         Register the throttle values and voltage messages received since the last call.
 
-        Both in order of arrival: stamps in s (NaN: unknown), `own` whether a message carries its
-        stamp, `before` the number of these voltage messages ahead of each throttle value.  At
-        least one voltage message must have arrived, now or earlier.
+        Each kind is in order of arrival: stamps in s (NaN: unknown), `own` whether a message
+        carries its stamp, `before` the number of these voltage messages that came before each
+        throttle value.  At least one voltage message must have arrived, now or earlier.
         """
         newest = np.maximum.accumulate(np.concatenate([[self._newest], voltage_stamps]))
         owns = np.concatenate([[self._own], voltage_own])

@@ -6,8 +6,8 @@ The format (encoding, delimiter, decimal mark, header lines, stated units) is de
 
 The csv module of the standard library reads the rows, in blocks whose columns are converted to
 numbers at once. This takes 1.1 s of CPU for 10^6 rows of 3 columns; row by row it would take 3.2
-s. `numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the former rejects blank cells and
-text, and the latter rejects rows of another width, gives no line numbers, and takes 100 MB.
+s. `numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but `loadtxt` rejects blank cells and
+text, and pyarrow rejects rows of another width, gives no line numbers, and takes 100 MB.
 """
 
 from __future__ import annotations
@@ -414,7 +414,7 @@ def _names_in_rows(rows: list[list[str]], width: int) -> list[str]:
 
 
 def _is_battery_state(row: list[str]) -> bool:
-    """Return whether the cells are those of a sensor_msgs/BatteryState."""
+    """Return whether the cells are a sensor_msgs/BatteryState."""
     counts = [*row[:2], *row[10:13]]
     return row[13:14] in (['True'], ['False']) and all(map(str.isdigit, counts)) and all(
         is_number(cell) or is_missing(cell) for cell in row[3:10])
