@@ -81,8 +81,8 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     window : float
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
-        Brown-out limit, V; if `cells` is given, V per cell, by default 3.3.  Without either, the
-        limit in the log's header, else, for a 5 V rail, the default of the node.
+        Brown-out limit, V; if `cells` is given, V per cell, by default 3.3.  If neither is given:
+        the limit in the log's header, else, for a 5 V rail, the default of the node.
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
@@ -342,7 +342,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     throttle : float, optional
         Throttle, 0..1; by default the 99 % quantile of the recording's throttle.
     recording : Recording or path, optional
-        Flight that gives level, sag, resistance and noise.
+        Flight from which level, sag, resistance and noise are taken.
     network : mapping, optional
         Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``.  If the
         recording shows the resistance or battery voltage, a value given here replaces it, as if

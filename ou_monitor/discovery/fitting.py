@@ -114,7 +114,7 @@ class Fitter:
 
     def whole(self, model: Composite) -> Composite:
         """Return a model fitted to everything, or unchanged if that fails."""
-        # Its laws were already fitted to all samples.
+        # The laws were already fitted to all samples.
         again = self._fit(model.terms, slice(0, self.samples.n), model)
         if again is None or not math.isfinite(float(again.density.sum())):
             return model

@@ -100,7 +100,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         # A numerical failure; the criticism is still valid.
         failure = f'The search for causes failed: {error}.'
     if failure and begun is not None:
-        # Once the load model has been chosen, the search is consistent at any time.
+        # Once the load model has been chosen, any state of the search can be used.
         found = _fit_everything(fitter, search, bank)
     names = found.search.accepted
     return Named(found.whole, bank, tuple(names),
