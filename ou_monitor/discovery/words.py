@@ -376,7 +376,7 @@ PLAIN_NAMES = {
     'tone': 'a spectral line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
-# Names with an underscore; the others are English words.
+# Names with an underscore; the other names are English words, and stay as they are.
 _CODE = re.compile(r'(?<![\w(])(' + '|'.join(
     name for name in sorted(PLAIN_NAMES, key=len, reverse=True) if '_' in name) + r')(?![\w)])')
 

@@ -24,7 +24,7 @@ from ou_monitor.text import printable
 
 # Endings of autopilot logs; the first bytes decide whether a file is one.
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
-# Endings that are common elsewhere: such files are skipped without a note if they are no logs.
+# Endings that are common elsewhere: such files are skipped without a note, unless they are logs.
 _COMMON = ('', '.log', '.txt')
 # Files that are noted as skipped: what they are, and why.
 _CSV = '.csv file', 'without columns of time and voltage'

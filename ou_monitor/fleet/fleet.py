@@ -1,9 +1,9 @@
 """
 Analyse many recordings, and resume a stopped run.
 
-Each result is saved in its own file at once.  It is used again for a recording with the same path,
-size and time of change, if the options and the version of the package are the same.  Failed
-recordings are not saved, so the next run tries them again.
+Each result is saved at once, in its own file.  A saved result is used again if path, size and time
+of change of the recording, the options, and the version of the package are the same.  Failures are
+not saved, so the next run tries these recordings again.
 """
 
 from __future__ import annotations

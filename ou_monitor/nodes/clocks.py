@@ -9,16 +9,16 @@ put on an even time line that slowly follows the source timestamps.
 
 A message of a steady source can be late, but not early: the lower convex hull of source timestamp
 against message number is a straight line with the period as its slope, and many messages lie near
-it (this separates clock skew from delays: Zhang, Liu & Xia 2002, "Clock synchronization algorithms
-for network measurements").  At any sampling rate, the hull must span many pauses, because a burst
-of 400 messages sent 10 us apart is a straight line too.
+it (Zhang, Liu & Xia 2002, "Clock synchronization algorithms for network measurements", separate
+clock skew from delays in this way).  At any sampling rate, the hull must span many pauses, because
+a burst of 400 messages sent 10 us apart is a straight line too.
 
 Limits: a constant delay remains.  The times of an unsteady source are not changed; if its
 intervals cannot be sampling intervals, as when a driver empties a buffer, `in_bursts` is true.
 
 `SimClockMap`: the middleware stamps every message with the wall clock of its sender.  If a bag is
 replayed at four times its speed, these stamps are four times too close, and alpha would be four
-times too large.  Messages on `/clock` have both times, and thus determine the map between them.
+times too large.  Messages on `/clock` contain simulated time too, and so determine the map to it.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class View:
     # Share of each variance that is due to the noise of the `ou` in the step before: 1 without
     # white noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
-    slope: FloatArray | float = 0.0  # Slope of the lines of the model, V/s; shape (n,)
+    slope: FloatArray | float = 0.0  # Slope of the tones of the model, V/s; shape (n,)
 
     @cached_property
     def rate(self) -> float:

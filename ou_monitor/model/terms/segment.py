@@ -52,7 +52,7 @@ class Segment:
     level: FloatArray  # Voltage of the rail without x, V; shape (n,)
     noise: FloatArray  # Factor on the std of the white measurement noise; shape (n,)
     voltage: FloatArray  # Reading, V; shape (n,)
-    slope: FloatArray | float = 0.0  # Slope of the lines, V/s; shape (n,); only for likelihoods
+    slope: FloatArray | float = 0.0  # Slope of the tones, V/s; shape (n,); only for likelihoods
     # Transformations of the normal draws of the white noise, in the order of their application.
     shape: list[Callable[[FloatArray], FloatArray]] = field(default_factory=list)
 

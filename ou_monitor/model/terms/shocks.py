@@ -205,7 +205,7 @@ class Glitches(Term):
 def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
                    lengths: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Return normal scores, gains in log density, and the number of parameters."""
-    # States: a good sample; first, second and third sample of a run with similar errors.
+    # States: a good sample; the first, second and third sample of a run of similar errors.
     e = view.z * np.sqrt(view.variance)
     keep, rest = _repetition(e, bad, view.train, spread)
     wide = np.sqrt(1.0 + spread * spread / view.variance)
@@ -418,8 +418,8 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
 
 
 # Minimum share of the Student-t part in the variance, for giving each sample a `power`.  If there
-# is white noise, powers would explain it too, so that the next fit would not find it; without
-# powers the variance is still right.
+# is white noise, powers would hide it from the next fit; without powers the variance is still
+# right.
 _ALONE = 0.99
 # Number of grid points of the variance, and probability on either side of the grid; for a fit:
 # number of bins of the share, and number and width of bins of asinh(score).
