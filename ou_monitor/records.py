@@ -284,7 +284,7 @@ class Counters:
     # Repeats of the last value by a logger that is faster than its source, dropped.  When repeats
     # are first recognised, those in the window are counted; earlier ones stay in `used`.
     held: int = 0
-    resets: int = 0  # Times the window was cleared (gap, or a clock that jumped back)
+    resets: int = 0  # How often the window was cleared (gap, or a clock that jumped back)
 
 
 # Parameters of an estimate whose standard errors refer to the logarithm.

@@ -366,7 +366,7 @@ def _with_point(text: str) -> str:
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
             skip: int, labels: Sequence[str], facts: bool) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
-    # A line of decimal numbers, such as a battery tester's line about a step, has no names.
+    # A line of decimal numbers, such as a battery tester's on a charging step, has no names.
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
         '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
     needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
@@ -422,7 +422,7 @@ def _is_battery_state(row: list[str]) -> bool:
 
 def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set[int],
                      ) -> tuple[list[str], list[str], int] | None:
-    """Return the same as `_header`; None if no line names all columns."""
+    """Return what `_header` does; None if no line names all columns."""
     units: list[str] = []
 
     def names_all(row: list[str]) -> bool:

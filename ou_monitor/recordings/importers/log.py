@@ -223,7 +223,7 @@ def near(t: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a longest subsequence of the stamps that does not go back."""
+    """Return which stamps form a longest subsequence that does not go back."""
     good = np.ones(t.size, dtype=bool)
     if (t[1:] >= t[:-1]).all():
         return good
