@@ -213,12 +213,12 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
 
 def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> str:
     if found.verdict is Verdict.NO_EFFECT:
-        return ('The plain OU simulates this recording: none of the statistics that can be '
+        return ('The plain OU reproduces this recording: none of the statistics that can be '
                 'computed at this length deviates.')
     left = remaining_words(found.remaining)
     return ('The simulation deviates from the recording, and no known cause explains it: '
             + f'{left}.' + (
-                f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part.'
+                f' The nearest causes of the catalogue ({listed(list(dropped))}) explain a part.'
                 if dropped else '') + (
                 f' {uncovered} samples are at a throttle that the rest of the recording does not '
                 'cover; this alone may explain the deviation.' if uncovered else ''))

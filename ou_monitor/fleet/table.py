@@ -57,11 +57,10 @@ COLUMNS = (
     Column('var_inf_se', 'number', '1', _LOG),
     Column('u0', 'number', 'V', 'mean level of the fit'),
     Column('u0_se', 'number', 'V', 'standard error of u0'),
-    Column('noise_std', 'number', 'V', 'white noise of the sensor'),
+    Column('noise_std', 'number', 'V', 'rms of the white noise of the sensor'),
     Column('excess_kurtosis', 'number', '1', 'excess kurtosis of the innovations; 0 for a '
            'Gaussian'),
-    Column('impulses', 'count', '', 'number of innovations above the largest expected from a '
-           'normal distribution'),
+    Column('impulses', 'count', '', 'number of innovations larger than normal noise would give'),
     Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none '
            'found'),
     Column('line_rms', 'number', 'V', 'rms of that line'),

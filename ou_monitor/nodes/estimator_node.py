@@ -55,8 +55,8 @@ MOST_THIN = 1024  # Maximum factor by which samples are thinned
 MOST_THROTTLES = 100
 STATE_FILE = Parameter(
     'state_file', '',
-    'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
-    "after the node; relative: under ROS's log directory); empty: off.")
+    'File that keeps a latched flag over a restart of the node (if a folder: a file in it, named '
+    "after the node; a relative path is under ROS's log directory); empty: off.")
 LANDED = 0.05  # Throttle above which the craft may be in flight
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 

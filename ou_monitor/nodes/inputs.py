@@ -280,8 +280,8 @@ class SourceFinder:
                         f"'{chosen.spec.field}' (msg_config '{chosen.config}')")
             elif types:
                 problem = (f"{topic} carries {', '.join(types)}, which no generic msg_config "
-                           f"describes ({', '.join(source.known_types)}): set {quantity}.type "
-                           f'and {quantity}.field, or msg_config.')
+                           f"describes (known: {', '.join(source.known_types)}): set "
+                           f'{quantity}.type and {quantity}.field, or msg_config.')
             if problem and self.problems.get(quantity) != problem:
                 self._node.get_logger().warning(problem, throttle_duration_sec=10.0)
             self.problems[quantity] = problem

@@ -100,7 +100,7 @@ def finding(verdict, causes=(), left=(), **more):
 
 
 @pytest.mark.parametrize('verdict, named, left, words', (
-    (Verdict.NO_EFFECT, False, False, 'The plain OU simulates this recording'),
+    (Verdict.NO_EFFECT, False, False, 'The plain OU reproduces this recording'),
     (Verdict.UNEXPLAINED, False, True, 'no known cause explains it: prediction errors are skewed'),
     (Verdict.EXPLAINED, True, False, 'the simulation passes every test'),
     (Verdict.PARTLY_EXPLAINED, True, False, 'comes closer, but is not yet right: too slow'),
