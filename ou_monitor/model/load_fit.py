@@ -38,15 +38,17 @@ _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1
 _CENTRE = {'endurance': math.log(2000.0)}
 # Prior deviation of a constant level, V per cell (it replaces the charge).
 _LEVEL_SD = 0.2
-# Search for the delay of the load.  Number of shifts tried to each side; maximum delay, s; ratio
-# to which a delay must reduce the squared residuals; time constants, s, of the high-pass that
-# removes trends, and of the low-pass for the second regressor.
-_SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
+# Search for the delay of the load: number of shifts tried to each side, and maximum delay, s.
+_SHIFTS, _LATEST = 10, 0.2
+_PAYS = 0.95  # Ratio to which a delay must reduce the squared residuals
+_SLOWER = 1.0  # Time constant of the high-pass that removes trends, s
+_LATE = 0.06  # Time constant of the low-pass for the second regressor, s
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
 # Bins over which the data are averaged before a fit: width, s (slow error and polarisation are
-# slower), and maximum share of the recording.  Minimum number of samples.
-_BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
+# slower), and maximum share of the recording.
+_BIN, _BIN_SHARE = 0.05, 0.01
+_LEAST = 20  # Minimum number of samples
 # The slow error of the load model is an OU: its time constant, s, and the standard deviations
 # tried, V per cell (the maximum was chosen on the recordings).
 SLOW_TIME = 20.0

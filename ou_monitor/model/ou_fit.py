@@ -45,9 +45,8 @@ from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS
 # Minimum evidence for a relaxation over white noise alone, nats: more than white noise reached in
 # any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
-# Distance of the level's knots, s, at 1 Hz or faster; minimum readings per knot; minimum number of
-# spans between knots.
-_HATS, _PER_KNOT, _PARTS = 5.0, 5, 3
+_HATS = 5.0  # Distance of the level's knots, s, at 1 Hz or faster
+_PER_KNOT, _PARTS = 5, 3  # Minimum readings per knot, and minimum number of spans between knots
 # Lags, s, of throttle and current: from an ESC to polarisation.
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 # Maximum shift of throttle and current, samples, and number of readings used to find it.
@@ -57,8 +56,9 @@ _FAR = 20
 # Minimum range of a load that moves, relative to its maximum or 1, whichever is larger.
 _MOVED = 0.01
 # Minimum gap, in median steps: splitting the data at smaller gaps would cost more accuracy than
-# ignoring them.  Minimum number of readings between gaps.
-_GAP, _STRETCH = 5.0, 16
+# ignoring them.
+_GAP = 5.0
+_STRETCH = 16  # Minimum number of readings between gaps
 # Minimum share of the readings that pieces of equal length must contain.
 _HELD = 0.8
 # The shortest of OU_WINDOWS that determines alpha within this factor is used, else the longest.
@@ -81,8 +81,8 @@ _REFINE = (1.2, 0.6, 0.3, 0.15)
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Maximum number of steps towards the maximum, and convergence tolerance of a step.
 _LOOKS, _NEAR = 40, 0.05
-# Draws in each round, over all maxima; rounds; minimum share of the draws for a maximum.
-_DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
+_DRAWS, _ROUNDS = 1000, 4  # Draws in each round, over all maxima, and number of rounds
+_FEWEST_DRAWN = 0.05  # Minimum share of the draws for a maximum
 # Maximum excess over the lowest cost, nats, at which a minimum at another alpha is refined, and at
 # which it is then kept (e^-6 of the likelihood does not affect a 95 % interval).
 _REFINED, _RIVAL = 10.0, 6.0

@@ -21,11 +21,11 @@ from ou_monitor.records import FloatArray
 _SINGLE, _TO_OCTAVE = 16, 10
 # Limit at which scores are clipped.
 _FAR = 5.0
-# Maximum number of rounds of scoring; step of the numerical derivatives; convergence tolerance,
-# nats; maximum step of a coordinate.
-_ROUNDS, _STEP, _SETTLED, _MOST = 25, 1e-3, 0.01, 1.0
-# Initial and maximum damping of a step.
-_DAMPED, _STUCK = 1e-3, 1e4
+_ROUNDS = 25  # Maximum number of rounds of scoring
+_STEP = 1e-3  # Step of the numerical derivatives
+_SETTLED = 0.01  # Convergence tolerance, nats
+_MOST = 1.0  # Maximum step of a coordinate
+_DAMPED, _STUCK = 1e-3, 1e4  # Initial and maximum damping of a step
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ doc/messages.md lists its topics:
   whether the estimate is usable;
 - `throttle` and `rpm`, if `notch.count` is above 0: for the notches, which come before the
   low-pass; without `throttle`, the throttle in `state` is used;
-- `~/output`: has type, stamp and frame of the input; but a derivative is a geometry_msgs
-  AccelStamped or Vector3Stamped, or if the input has no stamp, a Float64.
+- `~/output`: has type, stamp and frame of the input; but a derivative, except of a bare number, is
+  a geometry_msgs AccelStamped or Vector3Stamped, or if the input has no stamp, a Float64.
 
 Limits: of an Imu only the angular velocity is filtered, of a BatteryState only the voltage, unless
 `input.field` names another field.  All other fields, including covariances, are copied unchanged.

@@ -129,11 +129,9 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         x, turn = ends[int(np.argmax(further))], turn + 1
 
 
-# Maximum number of Newton steps; gain, nats, below which they end; step lengths tried; minimum
-# curvature as a share of the largest.
-_NEWTON, _FLAT = 5, 0.05
-_SHARES = np.array([1.0, 0.4, 0.1])
-_STRAIGHT = 1e-3
+_NEWTON, _FLAT = 5, 0.05  # Maximum number of Newton steps, and gain, nats, below which they end
+_SHARES = np.array([1.0, 0.4, 0.1])  # Step lengths tried
+_STRAIGHT = 1e-3  # Minimum curvature as a share of the largest
 
 
 def mixture_cdf(z: FloatArray, weight: FloatArray, mean: FloatArray, std: FloatArray

@@ -100,9 +100,8 @@ class LoadDependentSigma(Term):
 
 # Penalty of the search for the position of a step, nats: ln of the number of positions tried (91).
 _STEP_COST = 4.5
-# Penalty of the search for a knot, nats; number of bins; minimum number of scores in a bin;
-# maximum number of knots.
-_KNOT_COST = 3.5
+_KNOT_COST = 3.5  # Penalty of the search for a knot, nats
+# Number of bins, minimum number of scores in a bin, and maximum number of knots.
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
 # Maximum |ln factor|: where white noise hides the rail, the data do not limit the factor.
 _MOST = 4.0
@@ -231,9 +230,8 @@ _LEAST_WHITE = 0.05
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
 # Maximum squared score once the curves are roughly known, to limit the effect of outliers.
 _LARGEST = 25.0
-# Number of rounds in which each curve is fitted given the others; minimum distance between knots
-# relative to the range of the input.
-_ROUNDS, _SPACING = 2, 0.02
+_ROUNDS = 2  # Number of rounds in which each curve is fitted given the others
+_SPACING = 0.02  # Minimum distance between knots, relative to the range of the input
 # Index of the curve that is applied to the sum of the other curves.
 SUM = len(INPUTS)
 

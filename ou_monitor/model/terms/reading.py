@@ -148,9 +148,9 @@ class LopsidedNoise(Term):
         return fit, most - even > 0.5 * math.log(z[view.train].size)
 
 
-# Minimum share of white noise in the one-step errors; number of bins of scores in a fit; limit of
-# the scores.
-_MOSTLY, _CELLS, _FARTHEST = 0.5, 400, 8.0
+_MOSTLY = 0.5  # Minimum share of white noise in the one-step errors
+_CELLS = 400  # Number of bins of scores in a fit
+_FARTHEST = 8.0  # Limit at which scores are clipped
 # Points and weights for expectations over a normal distribution.
 _NORMAL = np.polynomial.hermite_e.hermegauss(80)
 
@@ -373,9 +373,10 @@ class JitterOnLines(ClockJitter):
         return np.square(self.std * s.slope)
 
 
-# Maximum standard deviation of the errors of stamps, in steps; minimum score, in standard errors,
-# for a fit of errors on tones (half of its square is 6 nats; a cause needs 4 after its penalties).
-_MOST_ERROR, _STEEPER = 0.45, 3.5
+_MOST_ERROR = 0.45  # Maximum standard deviation of the errors of stamps, in steps
+# Minimum score for a fit of errors on tones, in standard errors: half of its square is 6 nats (a
+# cause needs 4 after its penalties).
+_STEEPER = 3.5
 
 
 def _square_correlation(square: FloatArray) -> float:
@@ -384,9 +385,9 @@ def _square_correlation(square: FloatArray) -> float:
     return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
 
 
-# Maximum number of samples in a fit; maximum fourth moment that jitter can cause; maximum
-# correlation of neighbouring squares, in standard errors.
-_SHORT, _MOST_KURTOSIS, _MOST_CORRELATION = 15000, 6.0, 4.0
+_SHORT = 15000  # Maximum number of samples in a fit
+_MOST_KURTOSIS = 6.0  # Maximum fourth moment of the scores that jitter can cause
+_MOST_CORRELATION = 4.0  # Maximum correlation of neighbouring squares, in standard errors
 _LEVELS = 7  # Number of discrete values of a stamp's error
 _LEAST_JITTER = 1e-12  # Minimum distance of phi from 0 and 1
 

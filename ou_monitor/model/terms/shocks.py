@@ -421,7 +421,7 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
 # is white noise, powers would hide it from the next fit; without powers the variance is still
 # right.
 _ALONE = 0.99
-# Number of grid points of the variance, and probability on either side of the grid; for a fit:
-# number of bins of the share, and number and width of bins of asinh(score).
+# Number of grid points of the variance, and probability on either side of the grid.
 _POINTS, _OUTSIDE = 40, 1e-10
+# For a fit: number of bins of the share, and number and width of bins of asinh(score).
 _SHARES, _CELLS, _WIDTH = 8, 300, 0.03

@@ -150,12 +150,11 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Number of segments in a recording; number of levels of ln sigma, which extend to +-8 standard
-# deviations, because later samples may leave the fitted range; number of segments between
-# normalisations, which prevent underflow.
-_SEGMENTS = 1500
+_SEGMENTS = 1500  # Number of segments in a recording
+# Number of levels of ln sigma; they extend to +-8 standard deviations, because later samples may
+# leave the fitted range.
 _LEVELS = 65
-_EVERY = 4
+_EVERY = 4  # Number of segments between normalisations, which prevent underflow
 # Minimum number of relaxation times of ln sigma in a recording: with 2, the standard error of the
 # logarithm of its variance is sqrt(2/2) = 1.
 _WANDERS = 2.0
@@ -163,10 +162,8 @@ _WANDERS = 2.0
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
 # Range of ln std, ln rate (1/s) and mean of ln sigma.
 _RANGE = np.array([[-4.0, -7.0, -math.inf], [1.0, 5.0, math.inf]])
-# Maximum number of evaluations in a first fit and in a refit; probability below which a level is
-# ignored.
-_EVALUATIONS = 60, 30
-_NOTICED = 1e-9
+_EVALUATIONS = 60, 30  # Maximum number of evaluations in a first fit, and in a refit
+_NOTICED = 1e-9  # Probability below which a level is ignored
 
 
 @lru_cache(maxsize=1)
