@@ -39,8 +39,8 @@ _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
 _PATIENCE = 30.0
 # Time between checks whether any worker is left, s.
 _LOOK = 1.0
-LOST = ('Two workers died on this recording, the second while no other recording was analysed: '
-        'they were killed, or the recording does not fit into memory.')
+LOST = ('A worker died while only this recording was analysed: the worker was killed, or the '
+        'recording does not fit into memory.')
 _RESUME = 'finished recordings are kept, and the same command resumes'
 # Index of a task in the list of arguments, its result, and its error.
 Outcome = tuple[int, Any, str]
