@@ -1,8 +1,8 @@
 """
 Tests of the process type at a load level, with calibrated p-values.
 
-Each test works on the one-step innovations of the fitted model, which are independent and standard
-normal if the level is a stationary OU in white noise:
+Each test but `correlated` works on the one-step innovations of the fitted model, which are
+independent and standard normal if the level is a stationary OU in white noise:
 
 =============  ========================================================================
 mean_drift     means of blocks of innovations, F test that includes the errors of the fit

@@ -1,11 +1,12 @@
 """
 Load levels: segments of a recording at constant throttle.
 
-A segment starts when throttle comes within the half width of a level, and ends when it is more
-than two half widths away, so that jitter of the stick does not split the segment.  The half width
-is `HALF_WIDTH`, or more if the stick jitters more.  A ramp that passes a level is not a segment.
-Limits: throttle is a command, not a current, so two segments at one throttle can have different
-loads, and a segment need not be stationary; levels closer than the jitter are merged.
+A segment starts when throttle comes within the half width of a level, and lasts until throttle is
+there for the last time before it leaves by two half widths (less if the next level is near), so
+that stick jitter does not split the segment.  The half width is `HALF_WIDTH`, or more if the
+stick jitters more.  A ramp that passes a level is not a segment.  Limits: throttle is a command,
+not a current, so two segments at one throttle can have different loads, and a segment need not be
+stationary; levels closer than the jitter are merged.
 """
 
 from __future__ import annotations

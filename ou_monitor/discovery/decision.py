@@ -82,7 +82,8 @@ def imitate(one: Kind, other: Kind) -> bool:
 
 def score_gain(kind: Kind, values: Statistics) -> float:
     """Return the gain of a kind by score tests, nats: half the square of its largest sign."""
-    # A score test is for one size and span; the fitted kind may gain several times as much.
+    # A low estimate, because a score test is for one form of the effect: a fit may gain several
+    # times as much.
     return 0.5 * max((value ** 2 for name, value in values.items() if _shows(kind, name, value)),
                      default=0.0)
 

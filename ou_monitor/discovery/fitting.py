@@ -163,7 +163,7 @@ class Fitter:
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
-            # The starting points of a law are terms of its name in another role.
+            # Candidates of a law have its NAME, but another class and ROLE (`clock_jitter`).
             starts = kind.candidates(view) if kind.ROLE is Role.LAW else None
             if starts == () and not self._finds_events(kind, view):
                 gain, start = self._law_gain(kind, view), None

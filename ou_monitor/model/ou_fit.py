@@ -42,8 +42,8 @@ from ou_monitor.model.sinusoid import tones
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS, OuFacts
 
-# Minimum evidence for a relaxation over white noise alone, nats: more than white noise reached in
-# any window of 120 simulated recordings (test_ou_fit.py repeats a part).
+# Minimum evidence for a relaxation over white noise alone, nats.  No window of 120 simulated
+# recordings of white noise reached it (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
 _HATS = 5.0  # Distance of the level's knots, s, at 1 Hz or faster
 _PER_KNOT, _PARTS = 5, 3  # Minimum readings per knot, and minimum number of spans between knots
@@ -70,7 +70,7 @@ FEWEST = 40  # Minimum number of readings beyond the number of regressors
 _AT_ONCE = 1 << 20
 # Number of points of the first grid in ln(alpha dt), logit(share of the OU) and ln(walk); ends of
 # the logit.  The upper end is close to a share of 1: at alpha dt = 0.004, even white noise of 1e-3
-# of the variance is half of the spectrum at the highest frequency.
+# of the variance is half as large as the OU in the spectrum at the highest frequency.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
 # For the bounds: further points in logit(share) about the best of the grid, and successive steps
 # in ln(walk) that refine the walk.

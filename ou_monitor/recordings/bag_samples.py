@@ -1,8 +1,9 @@
 """
 The voltage samples of a bag with their throttle and current.
 
-A msg config fits if the bag has its topic, possibly in a namespace, with its type. A generic
-config also fits if exactly one topic has its type. If several configs fit, the user must choose.
+A msg config fits if the bag has its topic, possibly in a namespace, with its type. If none fits, a
+generic config fits if a topic other than its throttle's has its type. The user must choose if
+several configs or topics fit.
 Limits: all samples of a bag are held in memory, 150 MB for an hour at 1 kHz.
 """
 
@@ -253,7 +254,8 @@ def read_bag(
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
              ends: FloatArray, own: npt.NDArray[np.bool_], sample_rate: float | None,
              ) -> tuple[ThrottleHold, int]:
-    """Return throttle or current held over voltage blocks (ends in s), and its count of NaN."""
+    """Return what holds throttle or current, and the number of dropped NaN."""
+    # ends: stamp of the last sample of each voltage message, s.
     # Before `first` (ns), the start of the part, only the last known value is needed.
     known = np.flatnonzero(np.isfinite(column.values[:column.place(first)]))
     _, column = column.split(int(known[-1]) if known.size else 0)

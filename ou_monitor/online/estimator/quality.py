@@ -40,7 +40,7 @@ class Quality:
 
 
 def examine(y: FloatArray, held: float = 1.0) -> Quality:
-    """Return the findings about readings (y in V, samples per reading with repeats)."""
+    """Return the findings about readings, V (held: samples per reading, if repeated)."""
     if y.size < _ENOUGH:
         return Quality(held=held)
     steps = np.diff(y)
