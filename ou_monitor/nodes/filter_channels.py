@@ -17,8 +17,8 @@ from ou_monitor.nodes.sources import definition_of, message_class
 from ou_monitor.recordings.cdr import value_path
 from ou_monitor.stream.config import FieldPath, FieldSpec, put, walk
 
-# Output types of derivatives: of an angular velocity; of another signal with a stamp (in x); of a
-# signal without a stamp.
+# Output types of derivatives: of an angular velocity; of another signal with a stamp (its
+# derivative is the vector's x); of a signal without a stamp.
 ACCEL, VECTOR, PLAIN = ('geometry_msgs/msg/AccelStamped', 'geometry_msgs/msg/Vector3Stamped',
                         'std_msgs/msg/Float64')
 _NONE = (math.nan, math.nan, math.nan)
@@ -80,7 +80,7 @@ def channels_of(kind: str, field: str, *, mode: str = 'lowpass') -> Channels:
         raise InputError(
             f"input.type: cannot filter '{kind}' without input.field (the path of its signal); "
             f'{nearest(kind, CHANNELS)}')
-    # A bare number has no unit, so its derivative is published with the same type.
+    # A bare number has no unit: without `input.field`, its derivative keeps its type.
     return found if mode != 'derivative' or found is _DATA else _derivative(kind, found)
 
 

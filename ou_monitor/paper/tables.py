@@ -149,8 +149,9 @@ def _load_rows(state: PrintedLoad) -> list[Row]:
 
 def _repetitions() -> list[Row]:
     said = {
-        'Section 4.5': 'The number, from Fig. 5, is a limit of the filtering only if it comes '
-                       'from the network and not from the oscilloscope.',
+        'Section 4.5': 'The paper infers that filtration is at its limit; the number, from Fig. '
+                       '5, shows that only if it comes from the network and not from the '
+                       'oscilloscope.',
         'Section 8': 'The number is from Fig. 5. A rate alone does not confirm an OU: every '
                      'first-order system has one, AC coupling included.'}
     return [Row(
@@ -210,7 +211,7 @@ def _threshold_rows() -> list[Row]:
             f'probability; the resolution of Vrms allows {spread[2] / spread[1]:.0f} to '
             f'{spread[3] / spread[0]:.0f}.',
             inputs=(spread[2] / spread[1], spread[3] / spread[0])),
-        Row('Section 4.4', f'falls by {1e3 * DELTA:g} mV a second, 40 over 10 %', '',
+        Row('Section 4.4', f'falls by {1e3 * DELTA:g} mV per second: number at 40 over 10 %', '',
             Printed('> 1'), times[0] / times[1], 'quotient of mean first-passage times',
             'P(|U| > delta) is a share of time, not a frequency; the mean first-passage time to '
             f'such a fall is {times[0]:.3g} s at 10 % and {times[1]:.3g} s at 40 %.'),

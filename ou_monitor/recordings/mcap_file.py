@@ -246,7 +246,7 @@ class McapFile:
                 index.message_index_length, index.uncompressed_size)
         if end > self._size:
             return {}
-        # With `partial` the summary gives only the places of chunks.
+        # With `partial` the statistics of the summary are not trusted.
         stated = None if partial else summary.statistics
         if stated is not None and bool(spans) == bool(stated.message_count) == bool(
                 stated.channel_message_counts) and sum(
@@ -518,7 +518,8 @@ class McapFile:
         try:
             data = self._data(file, span)
             file.seek(span.offset + span.length)
-            # Longest index: 15 bytes per channel and 16 per message (each has 31 bytes or more).
+            # Longest index: 15 bytes per channel, and 16 per message, of which each takes more in
+            # `data`.
             index = file.read(min(span.index_length, len(data) + 15 * 65536))
             table = self._messages(data, index)
             if span.unpacked and ((table.log_time < span.start_ns)
