@@ -211,7 +211,7 @@ def _threshold_rows() -> list[Row]:
             f'probability; the resolution of Vrms allows {spread[2] / spread[1]:.0f} to '
             f'{spread[3] / spread[0]:.0f}.',
             inputs=(spread[2] / spread[1], spread[3] / spread[0])),
-        Row('Section 4.4', f'falls by {1e3 * DELTA:g} mV per second: number at 40 over 10 %', '',
+        Row('Section 4.4', f'rate of falls by {1e3 * DELTA:g} mV, 40 over 10 %', '',
             Printed('> 1'), times[0] / times[1], 'quotient of mean first-passage times',
             'P(|U| > delta) is a share of time, not a frequency; the mean first-passage time to '
             f'such a fall is {times[0]:.3g} s at 10 % and {times[1]:.3g} s at 40 %.'),

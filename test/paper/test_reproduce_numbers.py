@@ -207,8 +207,7 @@ def test_falls_agree_with_simulated_paths():
             int(alive.sum()))
         time[alive] += dt
         alive &= u < level
-    row = by_quantity(tables.probabilities(rng, 1000))[
-        'falls by 100 mV per second: number at 40 over 10 %']
+    row = by_quantity(tables.probabilities(rng, 1000))['rate of falls by 100 mV, 40 over 10 %']
     said = float(re.search(r'([0-9.]+) s at 40 %', row.sentence).group(1))
     assert abs(time.mean() - said) < 4.0 * time.std() / math.sqrt(2000) + 0.02 * said
     assert row.verdict is RowVerdict.AGREES
