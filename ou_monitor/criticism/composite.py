@@ -134,6 +134,7 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
     return View(z=z, variance=gaussian.variance, phi=gaussian.phi,
                 state=np.concatenate(([0.0], residual[:-1])), residual=residual,
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
-                train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
+                by_current=samples.by_current, train=part,
+                trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
                 driven=np.clip(s.added / gaussian.variance, 0.0, 1.0),
                 slope=slope_of_lines(samples, gaussian.terms))

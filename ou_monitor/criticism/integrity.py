@@ -8,7 +8,7 @@ scatter about an even grid, the scatter is real only if the voltage increments f
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -112,7 +112,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
     recorded = recording.has_throttle or math.isfinite(full)
-    samples = Samples(stamps.t, v, _usable_throttle(u, recorded, notes))
+    samples = Samples(stamps.t, v, _usable_throttle(u, recorded, notes),
+                      by_current=math.isfinite(full))
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
         notes.append(f'{between.size} samples around sudden changes were kept as well.')
@@ -127,7 +128,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
 def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
     at = np.searchsorted(samples.t, t)
     more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
-    return Samples(np.insert(samples.t, at, t), np.insert(samples.voltage, at, v), more)
+    return replace(samples, t=np.insert(samples.t, at, t),
+                   voltage=np.insert(samples.voltage, at, v), throttle=more)
 
 
 def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> float:

@@ -62,6 +62,7 @@ class Samples:
     # ADC codes as logged, V, if `voltage` is spread evenly within their cells; shape (n,).
     codes: FloatArray | None = None
     cell: float = 0.0  # Width of a cell, V; 0 without spreading
+    by_current: bool = False  # Whether `throttle` is a current as a share of the largest
     # Caches: columns by term; the last mean, V, by terms with their coefficients; the last design
     # (voltage, level, columns) by terms.
     _known: dict[Term, FloatArray] = field(default_factory=dict, init=False)
@@ -86,10 +87,11 @@ class Samples:
     def part(self, part: slice, voltage: FloatArray | None = None) -> Samples:
         """Return a part of the samples, with another voltage if one is given."""
         v = self.voltage if voltage is None else voltage
-        return Samples(self.t[part], v[part],
-                       None if self.throttle is None else self.throttle[part],
-                       self.longer or self if slice(None, part.stop) == part else None,
-                       None if self.codes is None else self.codes[part], self.cell)
+        return replace(
+            self, t=self.t[part], voltage=v[part],
+            throttle=None if self.throttle is None else self.throttle[part],
+            longer=self.longer or self if slice(None, part.stop) == part else None,
+            codes=None if self.codes is None else self.codes[part])
 
     def columns(self, term: Term) -> FloatArray:
         """Return the columns of a term of the mean, cached; shorter parts share them."""

@@ -84,7 +84,8 @@ def mean_response(samples: Samples, composite: Composite, view: View,
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _contains(term, own)), *own]
     # At the start the noise model is rough, and a growing sag would take the place of other terms.
-    forms = [form for term in pool if isinstance(term, LoadTransient) for form in term.forms()]
+    forms = [form for term in pool if isinstance(term, LoadTransient)
+             for form in term.forms(view.by_current)]
     pool += [term for term in (*forms, *_candidates(view)) if not _contains(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:

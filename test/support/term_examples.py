@@ -14,7 +14,7 @@ EXAMPLES = {
     'ou': OU,
     'load_sag': {'linear': 0.3, 'square': 0.1, 'growth': -0.02},
     'load_transient': {'gain': -0.2, 'tau': 0.03, 'delay': 0.0125, 'rise': 0.1,
-                       'square': -0.3},
+                       'square': -0.3, 'lagged': 0.2},
     'load_dependent_sigma': {'throttle': [0.0, 0.4, 1.0], 'log_factor': [0.0, 0.7, 0.4]},
     'load_dependent_alpha': {'slope': 0.8},
     'load_dependent_noise': {

@@ -37,6 +37,7 @@ class View:
     # white noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
     slope: FloatArray | float = 0.0  # Slope of the tones of the model, V/s; shape (n,)
+    by_current: bool = False  # Whether `throttle` is a current as a share of the largest
 
     @cached_property
     def rate(self) -> float:

@@ -79,13 +79,14 @@ _ROUNDING = 1e-9
 @dataclass(frozen=True)
 class LoadTransient(Term):
     """
-    Add gain * d(u) + square * d(u^2) + rise * max(d(u), 0), with d(x) = x - low-pass of x (tau).
+    Add gain * d(u) + square * d(u^2) + lagged * (u^2 - low(u)^2) + rise * max(d(u), 0).
 
-    u is the delayed throttle.  Without `square`, a unit step up adds (gain + rise) * exp(-t/tau),
-    and a unit step down adds -gain * exp(-t/tau): motors draw more current while they speed up,
-    but return no current while they slow down.  gain > 0 delays the sag (if gain and square equal
-    the sag's linear and square, the sag is low-passed); gain < 0 deepens the sag at first
-    (inrush).
+    u is the delayed throttle, low(x) the low-pass of x (tau), and d(x) = x - low(x).  A unit step
+    up adds (gain + rise) * exp(-t/tau), and a unit step down adds -gain * exp(-t/tau): motors draw
+    more current while they speed up, but return no current while they slow down.  gain > 0 delays
+    the sag; gain < 0 deepens it at first (inrush).  If gain and square equal the sag's linear and
+    square, the sag is low-passed; if gain and lagged do, throttle is low-passed before the sag,
+    as by a motor whose speed lags.
     """
 
     NAME: ClassVar[str] = 'load_transient'
@@ -93,10 +94,10 @@ class LoadTransient(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.MEAN
-    # A rise or square of 0 is not fitted.
+    # A rise, square or lagged of 0 is not fitted.
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
-        ('gain', 'rise', 'square'), lambda term: (
-            'gain', *(name for name in ('rise', 'square') if getattr(term, name))))
+        ('gain', 'rise', 'square', 'lagged'), lambda term: (
+            'gain', *(name for name in ('rise', 'square', 'lagged') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
     SEARCH: ClassVar[float] = 3.4
     MEASURED: ClassVar[bool] = True
@@ -118,11 +119,13 @@ class LoadTransient(Term):
     rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
     square: float = parameter('V', 'decaying part that follows the square of throttle',
                               label='decaying part, square', default=0.0)
+    lagged: float = parameter('V', 'decaying part that follows the square of the lagging throttle',
+                              label='decaying part, square of the lag', default=0.0)
 
     def about(self) -> tuple[str, str]:
         """Return meaning and remedy of a response of this sign and time constant."""
         kind = type(self)
-        late = self.gain + self.rise + self.square > 0.0
+        late = self.gain + self.rise + self.square + self.lagged > 0.0
         return (kind.MEANING, kind.REMEDY) if self.delay else _ABOUT[self.tau > _INRUSH, late]
 
     def start(self, rng: np.random.Generator) -> Effect:
@@ -156,9 +159,11 @@ class LoadTransient(Term):
                 slow[power] = float(low[-1])
                 return value - low
 
-            if self.gain or self.rise:
+            if self.gain or self.rise or self.lagged:
                 linear = change(1)
                 s.level += self.gain * linear + self.rise * np.maximum(linear, 0.0)
+                # u^2 - low^2 with low = u - linear.
+                s.level += self.lagged * (2.0 * throttle - linear) * linear
             if self.square:
                 s.level += self.square * change(2)
 
@@ -178,14 +183,17 @@ class LoadTransient(Term):
         latest = max(_LATEST, 4.0 * step)
         delays = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
         late = [cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in delays]
-        return tuple(form for term in (*lags, *late) for form in term.forms())
+        return tuple(form for term in (*lags, *late)
+                     for form in term.forms(view.by_current))
 
-    def forms(self) -> tuple[LoadTransient, ...]:
-        """Return variants to fit: linear, with a square, and with a rise if fast enough."""
-        plain = replace(self, rise=0.0, square=0.0)
-        inrush = self.tau < _INRUSH and not self.delay
-        return (plain, replace(plain, square=NEXT_TO_ZERO),
-                *([replace(plain, rise=NEXT_TO_ZERO)] if inrush else []))
+    def forms(self, by_current: bool) -> tuple[LoadTransient, ...]:
+        """Return variants to fit: linear, with a square, and those of motors if fast enough."""
+        names = ['square']
+        if self.tau < _INRUSH and not self.delay:
+            # A measured current does not lag behind the motors.
+            names += ['rise'] if by_current else ['rise', 'lagged']
+        plain = replace(self, rise=0.0, square=0.0, lagged=0.0)
+        return plain, *(replace(plain, **{name: NEXT_TO_ZERO}) for name in names)
 
 
 # Shortest visible time constant, in steps: a seventh of the response remains at the next sample.
