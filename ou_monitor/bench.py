@@ -1,5 +1,5 @@
 """
-The commands as functions that return a `Result`.
+The commands on recordings and models as functions that return a `Result`.
 
 A recording is a `Recording`, or a path that `read_recording` reads.  Modules are imported inside
 the functions, so that each function loads only what it uses.

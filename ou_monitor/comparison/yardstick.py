@@ -1,5 +1,5 @@
 """
-Compare a recording with simulations of it: measures, records, verdict.
+Measures of a recording and of its simulations, and the verdict.
 
 The two low levels lie halfway between two codes of the ADC, so that no reading equals them.  Dips
 below a level are counted with hysteresis, as in `supply_facts`.

@@ -86,9 +86,8 @@ class Samples:
 
     def part(self, part: slice, voltage: FloatArray | None = None) -> Samples:
         """Return a part of the samples, with another voltage if one is given."""
-        v = self.voltage if voltage is None else voltage
         return replace(
-            self, t=self.t[part], voltage=v[part],
+            self, t=self.t[part], voltage=(self.voltage if voltage is None else voltage)[part],
             throttle=None if self.throttle is None else self.throttle[part],
             longer=self.longer or self if slice(None, part.stop) == part else None,
             codes=None if self.codes is None else self.codes[part])

@@ -183,8 +183,7 @@ class LoadTransient(Term):
         latest = max(_LATEST, 4.0 * step)
         delays = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
         late = [cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in delays]
-        return tuple(form for term in (*lags, *late)
-                     for form in term.forms(view.by_current))
+        return tuple(form for term in (*lags, *late) for form in term.forms(view.by_current))
 
     def forms(self, by_current: bool) -> tuple[LoadTransient, ...]:
         """Return variants to fit: linear, with a square, and those of motors if fast enough."""
