@@ -290,8 +290,8 @@ class _Regression:
         if chosen not in self._known:
             at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
             inside, *lost = _losses(self._fitted, self._scored, at).tolist()
-            search = sum(self._pool[k].SEARCH for k in chosen)
-            value = -max(inside + self._penalty * at.size, sum(lost)) - search
+            price = sum(self._pool[k].SEARCH + self._pool[k].FORM_COST * self._n for k in chosen)
+            value = -max(inside + self._penalty * at.size, sum(lost)) - price
             self._known[chosen] = value, np.array(lost)
         return self._known[chosen]
 

@@ -222,3 +222,12 @@ def test_a_flight_is_told_apart_into_motor_lag_polarisation_and_discharge(seed):
 def test_a_current_does_not_lag_behind_the_motors():
     forms = [LoadTransient(0.0, 0.05, 0.0).forms(by_current) for by_current in (False, True)]
     assert [any(form.lagged for form in some) for some in forms] == [True, False]
+
+
+def test_a_lag_before_the_square_must_gain_more_than_one_after_it(driven, monkeypatch):
+    _, columns, voltage = driven
+    pool = [LoadTransient(0.0, 0.1, 0.0, square=0.1), LoadTransient(0.0, 0.1, 0.0, lagged=0.1)]
+    both = np.column_stack((columns[0], columns[1]))[:, :2]
+    found, _ = made(pool, [both, both], voltage, monkeypatch)
+    more = found._evidence((0,)) - found._evidence((1,))
+    assert more == pytest.approx(pool[1].FORM_COST * N) and more > 1.0

@@ -123,6 +123,8 @@ class Term:
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
     # Penalty for the choices of the search, nats, in addition to the penalty for free parameters.
     SEARCH: ClassVar[float] = 0.0
+    # Evidence per sample, nats, that this form of a response needs beyond other forms.
+    FORM_COST: ClassVar[float] = 0.0
     # Number of parameters that `apart` fits, outside the joint fit.
     APART: ClassVar[int] = 0
     # Whether a fit takes seconds; late in a search, such fits are skipped.
