@@ -315,8 +315,8 @@ _CONVERT = Command(
      Option('--voltage', metavar='NAME',
             help='voltage (default: the battery, if there is one)'),
      Option('--throttle', metavar='NAME',
-            help="throttle, or 'none' (default: motors, else the command to them, else "
-            'the stick)'),
+            help="throttle, or 'none' (default: motors, else the command to them or the "
+            'stick)'),
      Option('--current', metavar='NAME',
             help="current, or 'none' (default: from the same sensor as the voltage)"),
      Option('--signal', metavar='NAME', action='append', default=[],

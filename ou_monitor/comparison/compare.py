@@ -31,9 +31,9 @@ _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 _POINTS = 2000
 # Probability above which the other kind of level (constant or falling) is reported.
 _UNSURE = 0.05
-# Minimum time over which a model from a file is aligned with the beginning of the recording, s;
-# doubled until the mean over it scatters, between simulations, by at most `_STEADY` of the scatter
-# of single samples, so that it holds about ten independent pieces.
+# Minimum time at the beginning of the recording over which a model from a file is aligned, s.  It
+# is doubled until the means over it differ between simulations by a standard deviation of at most
+# `_STEADY` times that of single samples; it then holds about ten independent pieces.
 _ALIGNED, _STEADY = 2.0, 0.3
 
 

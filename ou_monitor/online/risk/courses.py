@@ -16,7 +16,7 @@ Excursions do not need the load: the risk follows from the margin of the present
 the drops of this flight.  One further drop, twice the standard deviation of the last 5 s, is added
 for everything that has not been flown yet.  Horizons below 1 s or above 5 s use the nearest
 coefficients.  Limits: throttle is not used; beyond 8 deviations, the risk is assumed to fall like
-the tail of Student's t in the other laws.
+the tail of Student's t with five degrees of freedom (`forecast.py`).
 
 Limits of the blocks: if the source is slower than a block, empty blocks repeat its last value, up
 to a maximum silence; a horizon with a longer silence counts as incomplete.
