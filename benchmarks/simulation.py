@@ -18,8 +18,7 @@ from typing import Any
 from common import arguments, deliver, environment, table
 import numpy as np
 from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel
-from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
-from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.ou import NonlinearRestoring, OU
 from ou_monitor.model.terms.term import Term
 from ou_monitor.simulation import PRESETS, PROFILES
 from scipy.signal import lfilter

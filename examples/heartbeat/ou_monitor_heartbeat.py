@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.segment import Effect, Segment
-from ou_monitor.model.terms.term import parameter, Role, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Segment, Term, View
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import (
     driven, Events, fit_gaussian, GaussianFit, slope_of_lines, white_noise)
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.term import LawFit, Role, Term
+from ou_monitor.model.terms.term import LawFit, Role, Term, View
 from ou_monitor.records import FloatArray
 
 # Maximum rounds in which laws and Gaussian part are refitted.

@@ -18,8 +18,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.innovations import steps_before
 from ou_monitor.model.sinusoid import fit_sinusoid, Sinusoid
 from ou_monitor.model.spectral_lines import find_lines
-from ou_monitor.model.terms.segment import Segment
-from ou_monitor.model.terms.term import Term
+from ou_monitor.model.terms.term import Segment, Term
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 from scipy.special import ndtri

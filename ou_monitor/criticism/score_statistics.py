@@ -23,7 +23,7 @@ from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.lines import order_power
+from ou_monitor.model.terms.tones import order_power
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 from scipy.special import ndtri, stdtr, stdtrit

@@ -16,11 +16,10 @@ import math
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.innovations import Filter, StateSpace
-from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import JitterOnLines
-from ou_monitor.model.terms.segment import Segment
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.slow import ACCoupling, bridge
+from ou_monitor.model.terms.term import Role, Segment, Term
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 

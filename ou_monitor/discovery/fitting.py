@@ -20,11 +20,10 @@ from ou_monitor.criticism.structure import (
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.gain import all_moved
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.load_response import LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
-from ou_monitor.model.terms.term import LawFit, Role, Term
+from ou_monitor.model.terms.term import LawFit, Role, Term, View
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 

@@ -22,11 +22,10 @@ from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.search import (
     kinds_of, name_causes, position, Progress, Search, under_load, without_causes)
 from ou_monitor.model.terms.catalogue import blamed
-from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.model.terms.tones import Resonance, Tone
+from ou_monitor.model.terms.tones import prominence, Resonance, Tone
 
 # Maximum number of searches, each without the causes withdrawn before.
 _TURNS = 3

@@ -27,10 +27,9 @@ from ou_monitor.discovery import decision
 from ou_monitor.model.load import INRUSH_TIME
 from ou_monitor.model.load_fit import fit_load
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, LONGEST, SHORTEST
 from ou_monitor.model.terms.slow import Drift
-from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
+from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term, View
 from ou_monitor.records import FloatArray
 
 # Number of blocks that are held out in turn.

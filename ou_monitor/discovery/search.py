@@ -25,13 +25,13 @@ from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS
 from ou_monitor.discovery.regression import load_terms, mean_response
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent import (
     LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import ACCoupling
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.model.terms.tones import lines_of, Tone
 from ou_monitor.records import FloatArray

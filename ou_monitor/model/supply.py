@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import charge_at, LoadStart, open_circuit
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import Term
+from ou_monitor.model.terms.term import Effect, Segment, Stage, Term
 from ou_monitor.records import FloatArray
 
 # Number of samples that `SupplyModel.simulate` draws at a time: limits memory, and keeps the data

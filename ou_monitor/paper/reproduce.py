@@ -15,8 +15,8 @@ import numpy as np
 from ou_monitor.criticism.curves import even_on_log
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.slow import ACCoupling
 from ou_monitor.paper import published, switching, tables, transient
 from ou_monitor.paper.crest import (
     Crests, impulse_height, jump_rows, JUMP_SCREENS_MS, JumpCrest, largest, mean_and_error,

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.slow import ACCoupling
 from ou_monitor.paper import published
 from ou_monitor.paper.published import Printed, Range, Row
 from ou_monitor.records import FloatArray

@@ -7,10 +7,10 @@ from numpy.testing import assert_allclose
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import columns_of, evaluate, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
-from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_dependent import LoadDependentAlpha
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.slow import ACCoupling
 
 
 def test_the_first_sample_behind_a_high_pass_has_the_law_of_its_throttle():

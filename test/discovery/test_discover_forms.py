@@ -8,15 +8,14 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import fit_gaussian
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.ac_coupling import ACCoupling
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.lines import order_lines
 from ou_monitor.model.terms.load_response import LoadSag
-from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
-from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.ou import NonlinearRestoring, OU
 from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 from ou_monitor.model.terms.shocks import Glitches
+from ou_monitor.model.terms.slow import ACCoupling
+from ou_monitor.model.terms.term import View
+from ou_monitor.model.terms.tones import order_lines
 import pytest
 from scipy.signal import lfilter
 

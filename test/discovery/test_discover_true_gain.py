@@ -8,17 +8,15 @@ from ou_monitor.analysis.noise import dip_begins
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery.gain import (
-    blocks_of, covered, gain_of, held_out)
+from ou_monitor.discovery.gain import blocks_of, covered, gain_of, held_out
 from ou_monitor.discovery.load_effects import low_dips
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import Jumps
-from ou_monitor.model.terms.slow import Drift, SecondRelaxation
+from ou_monitor.model.terms.slow import ACCoupling, Drift, SecondRelaxation
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import Recording
 import pytest

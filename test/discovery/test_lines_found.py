@@ -14,13 +14,12 @@ from ou_monitor.discovery import fitting
 from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.named import _in_doubt, _SURE
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import HeavyTails
 from ou_monitor.model.terms.slow import SecondRelaxation
-from ou_monitor.model.terms.tones import Resonance, ThrottleTone, Tone
+from ou_monitor.model.terms.tones import prominence, Resonance, ThrottleTone, Tone
 from ou_monitor.records import NAN, Recording
 from project import needs_recordings, REAL, recorded
 import pytest

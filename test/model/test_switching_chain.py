@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
-from ou_monitor.model.terms.laws import normal_scores, View
 from ou_monitor.model.terms.regime_switching import (
     calm_levels, chain_of, rates_between, Scores, stationary_law, step_chances, without_levels)
+from ou_monitor.model.terms.term import normal_scores, View
 import pytest
 from scipy.signal import lfilter
 from scipy.special import ndtr

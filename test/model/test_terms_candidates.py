@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.lines import order_power
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
     _SLOW_AHEAD, _slow_levels, RegimeSwitching, relaxing)
+from ou_monitor.model.terms.term import View
+from ou_monitor.model.terms.tones import order_power
 import pytest
 from scipy.linalg import dft
 from scipy.stats import median_abs_deviation

@@ -1,8 +1,8 @@
 """The EM algorithm of `jumps`, against the largest likelihood found otherwise, and its law."""
 
 import numpy as np
-from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.shocks import _mixture, Jumps
+from ou_monitor.model.terms.term import View
 import pytest
 from scipy.optimize import minimize
 from scipy.stats import kstest, norm

@@ -4,9 +4,8 @@ from itertools import combinations
 import math
 
 import numpy as np
-from ou_monitor.model.terms.laws import (
-    climb, curvature_se, mixture_cdf, normal_scores, refine)
 from ou_monitor.model.terms.shocks import _best_runs
+from ou_monitor.model.terms.term import climb, curvature_se, mixture_cdf, normal_scores, refine
 import pytest
 from scipy.stats import norm
 

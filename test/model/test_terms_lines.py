@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.lines import CONSTANT, power_spread, RINGING
+from ou_monitor.model.terms.term import View
+from ou_monitor.model.terms.tones import CONSTANT, power_spread, RINGING
 import pytest
 from scipy.signal import welch
 from term_examples import agrees, clusters, has_covariance, still, term

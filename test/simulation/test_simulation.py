@@ -8,8 +8,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.model.load import charge_at, LoadStart, open_circuit, SIZE
 from ou_monitor.model.supply import SEGMENT, SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
-from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
-from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.ou import NonlinearRestoring, OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.online.risk.flag import FlagLevel

@@ -9,10 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import by_parameters, parameter, parameters, Role, Term
+from ou_monitor.model.terms.term import (
+    by_parameters, Effect, parameter, parameters, Role, Segment, Stage, Term, View)
 from ou_monitor.records import FloatArray
 
 

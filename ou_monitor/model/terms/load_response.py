@@ -9,9 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
+from ou_monitor.model.terms.term import (
+    by_parameters, Effect, NEXT_TO_ZERO, parameter, Role, Segment, Stage, Term, View)
 from ou_monitor.records import FloatArray
 
 

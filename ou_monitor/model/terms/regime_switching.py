@@ -18,9 +18,9 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores, View
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import LawFit, parameter, Role, Term
+from ou_monitor.model.terms.term import (
+    climb, curvature_se, Effect, LawFit, log_normal, normal_scores, parameter, Role, Segment,
+    Stage, Term, View)
 from ou_monitor.records import FloatArray
 from scipy.linalg import expm
 from scipy.special import ndtr

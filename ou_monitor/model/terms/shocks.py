@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.hidden_chain import forward
-from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores, View
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import LawFit, parameter, Role, Term
+from ou_monitor.model.terms.term import (
+    climb, curvature_se, Effect, LawFit, log_normal, normal_scores, parameter, Role, Segment,
+    Stage, Term, View)
 from ou_monitor.records import FloatArray
 from scipy.special import gammainccinv, gammaincinv, ndtr
 

@@ -9,9 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.terms.laws import climb, curvature_se, normal_scores, refine, View
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import LawFit, parameter, Role, Term
+from ou_monitor.model.terms.term import (
+    climb, curvature_se, Effect, LawFit, normal_scores, parameter, refine, Role, Segment, Stage,
+    Term, View)
 from ou_monitor.records import FloatArray
 from scipy.linalg import eigh_tridiagonal
 from scipy.special import comb, digamma, ndtr
