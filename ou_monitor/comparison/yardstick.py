@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.noise import dip_begins, noise_of, remainder, rise_that_ends
+from ou_monitor.analysis.supply import dip_begins, noise_of, remainder, rise_that_ends
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.model.sinusoid import LOBE
 from ou_monitor.model.spectral_lines import find_lines

@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.noise import rise_at
+from ou_monitor.analysis.supply import rise_at
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.score_statistics import criticise, family_chance, family_edge
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.decision import relaxes
-from ou_monitor.discovery.finding import (
-    Cause, Criticism, Finding, LoadFall, LowDips, Verdict)
+from ou_monitor.discovery.finding import Cause, Criticism, Finding, LoadFall, LowDips, Verdict
 from ou_monitor.discovery.fitting import (
     COLLINEAR, Fitter, follows_time, standard_errors, with_reach)
 from ou_monitor.discovery.gain import (

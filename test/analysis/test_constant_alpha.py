@@ -4,11 +4,11 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_result import fit_all
-from ou_monitor.analysis.levels import LoadLevel
-from ou_monitor.analysis.noise import remainder
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change, SigmaChange
+from ou_monitor.analysis.level_result import fit_all
+from ou_monitor.analysis.level_tests import alpha_constancy, sigma_change, SigmaChange
+from ou_monitor.analysis.levels import LoadLevel
+from ou_monitor.analysis.supply import remainder
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy import stats

@@ -3,7 +3,7 @@
 import numpy as np
 from ou_monitor.analysis.level_result import fit_all
 from ou_monitor.analysis.levels import find_levels
-from ou_monitor.analysis.noise import remainder
+from ou_monitor.analysis.supply import remainder
 from ou_monitor.model.spectral_lines import find_lines, without_lines
 from ou_monitor.records import Recording
 from scipy.signal import lfilter

@@ -9,10 +9,10 @@ every bag and of every recorded run there is, tables and raw logs.
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.level_result import fit_all, fit_parts
+from ou_monitor.analysis.level_tests import alpha_constancy, sigma_change
 from ou_monitor.analysis.levels import find_levels, LevelSegment
-from ou_monitor.analysis.noise import remainder
+from ou_monitor.analysis.supply import remainder
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine

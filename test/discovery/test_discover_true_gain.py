@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor import discover
-from ou_monitor.analysis.noise import dip_begins
+from ou_monitor.analysis.supply import dip_begins
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate

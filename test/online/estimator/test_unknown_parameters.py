@@ -7,7 +7,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.analysis.analyze import analyze, as_data
-from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
+from ou_monitor.analysis.level_tests import alpha_constancy, sigma_change
 from ou_monitor.online.estimator.fit import FitEnd, WindowFit
 from ou_monitor.online.estimator.quality import judge, Quality
 from ou_monitor.records import (
