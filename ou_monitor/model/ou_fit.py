@@ -57,7 +57,7 @@ _FAR = 20
 _MOVED = 0.01
 # Minimum gap, in median steps: splitting the data at smaller gaps would cost more accuracy than
 # ignoring them.
-_GAP = 5.0
+GAP = 5.0
 _STRETCH = 16  # Minimum number of readings between gaps
 # Minimum share of the readings that pieces of equal length must contain.
 _HELD = 0.8
@@ -116,7 +116,7 @@ def usual_walk(v: FloatArray) -> float:
 def stretches(t: FloatArray) -> list[slice]:
     """Return the stretches between gaps; a few lost messages do not count as a gap."""
     steps = np.diff(t)
-    gaps = np.flatnonzero(steps > _GAP * np.median(steps))
+    gaps = np.flatnonzero(steps > GAP * np.median(steps))
     edges = [0, *(gaps + 1).tolist(), t.size]
     return [slice(a, b) for a, b in zip(edges, edges[1:]) if b - a >= _STRETCH]
 

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import functools
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
 # Number of ordinates at low frequencies that are not binned, and bins per octave above them.
@@ -95,9 +97,16 @@ def cosines(x: FloatArray) -> FloatArray:
     # Computed by one Fourier transform of the even samples followed by the reversed odd samples
     # (Makhoul, IEEE Trans. Acoust. Speech Signal Process. 28 (1980) 27).
     F = np.fft.rfft(np.concatenate([x[:, ::2], x[:, 1::2][:, ::-1]], axis=1), axis=1)
-    F *= np.exp(-0.5j * np.pi / n * np.arange(F.shape[1])) * math.sqrt(2.0 / n)
-    F[:, 0] *= math.sqrt(0.5)
+    F *= _turned(n)
     return np.concatenate([F.real, -F.imag[:, (n - 1) // 2:0:-1]], axis=1)
+
+
+@functools.lru_cache(maxsize=8)
+def _turned(n: int) -> npt.NDArray[np.complex128]:
+    """Return the factors with which a Fourier transform becomes a cosine transform."""
+    factors = np.exp(-0.5j * np.pi / n * np.arange(n // 2 + 1)) * math.sqrt(2.0 / n)
+    factors[0] *= math.sqrt(0.5)
+    return np.asarray(factors, np.complex128)
 
 
 # Frequencies at which the absorption by a regression is tabulated, radians per sample.
@@ -110,6 +119,51 @@ def absorbed_by(basis: FloatArray) -> FloatArray:
     n = basis.shape[1]
     total = np.append(0.0, np.cumsum(np.sum(cosines(basis) ** 2, axis=0)))
     return np.asarray(np.interp(ABSORBED_AT, np.pi * (np.arange(n + 1) - 0.5) / n, total))
+
+
+class _Bins:
+    """Bins of the ordinates of stretches of readings; arrays have shape (bins,)."""
+
+    def __init__(self, lengths: tuple[int, ...], each_mean: bool) -> None:
+        # Lost messages may cause hundreds of stretches, so stretches of similar length share bins.
+        groups: dict[int, list[int]] = {}
+        for k, size in enumerate(lengths):
+            groups.setdefault(round(math.log(size) / _WIDTH), []).append(k)
+        # For each stretch: its number, its first bin, and the ends of its bins.
+        self.stretches: list[tuple[int, int, npt.NDArray[np.intp]]] = []
+        sizes, places, begin = [], [], 0
+        for group in groups.values():
+            longest = max(lengths[k] for k in group)
+            edges = [*range(min(_ONE_BY_ONE, longest) + 1)]
+            while edges[-1] < longest:
+                edges.append(min(longest, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
+            # For each bin: number of ordinates, sum of their indices over the length, and sum of
+            # (-1)^index.
+            sums = np.zeros((3, len(edges) - 1))
+            for k in group:
+                size = lengths[k]
+                ends = np.append([a for a in edges[:-1] if a < size], min(edges[-1], size))
+                count = np.diff(ends)
+                sums[:, :count.size] += np.stack([
+                    count, count * 0.5 * (ends[:-1] + ends[1:] - 1) / size,
+                    count % 2 * (1 - 2 * (ends[:-1] % 2))])
+                sums[0, 0] -= each_mean
+                self.stretches.append((k, begin, ends))
+            begin += sums.shape[1]
+            places.append(sums)
+            sizes.append(np.full(sums.shape[1], sum(lengths[k] for k in group) / len(group)))
+        self.size = np.concatenate(sizes)
+        self.count, place, sign = np.concatenate(places, axis=1)
+        omega = np.pi * place / np.maximum(self.count, 1e-9)
+        self.sign = sign / np.maximum(self.count, 1.0)
+        self.chord = 4.0 * np.sin(0.5 * omega) ** 2
+        # Sum of the squares of an ordinate's weights on the first and the last reading.
+        self.ends = np.where(omega > 0.0, 4.0 - self.chord, 2.0) / self.size
+        # Inverse of the ordinates of a random walk, with a nominal value for the mean (omega 0).
+        self.walk = 4.0 * np.sin(0.5 * np.maximum(omega, 0.5 * np.pi / self.size)) ** 2
+
+
+_bins = functools.lru_cache(maxsize=8)(_Bins)
 
 
 class CrossSpectrum:
@@ -125,56 +179,26 @@ class CrossSpectrum:
         # readings.
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
-        # Lost messages may cause hundreds of stretches, so stretches of similar length share bins.
-        groups: dict[int, list[FloatArray]] = {}
-        for part in np.split(rows, np.cumsum(lengths)[:-1], axis=1):
-            groups.setdefault(round(math.log(part.shape[1]) / _WIDTH), []).append(part)
-        crosses, places, sizes = [], [], []
-        for group in groups.values():
-            longest = max(part.shape[1] for part in group)
-            edges = [*range(min(_ONE_BY_ONE, longest) + 1)]
-            while edges[-1] < longest:
-                edges.append(min(longest, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
-            cross = np.zeros((len(edges) - 1, q, q))
-            # For each bin: number of ordinates, sum of their indices over the length, sum of
-            # (-1)^index, and number of ordinates absorbed by the earlier regression.
-            sums = np.zeros((4, len(edges) - 1))
-            for part in group:
-                size = part.shape[1]
-                C = cosines(part)
-                if q == 1:
-                    C[:, 0] = 0.0
-                starts = [a for a in edges[:-1] if a < size]
-                ends = np.append(starts, min(edges[-1], size))
-                bins = len(starts)
-                count = np.diff(ends)
-                sums[:3, :bins] += np.stack([
-                    count, count * 0.5 * (ends[:-1] + ends[1:] - 1) / size,
-                    count % 2 * (1 - 2 * (ends[:-1] % 2))])
-                if absorbed is not None:
-                    sums[3, :bins] += size * np.diff(np.interp(
-                        np.pi * (ends - 0.5) / size, ABSORBED_AT, absorbed))
-                sums[0, 0] -= q == 1
-                for k, row in enumerate(C):
-                    cross[:bins, k, k:] += np.add.reduceat(C[k:] * row, starts, axis=1).T
-            crosses.append(cross)
-            places.append(sums)
-            sizes.append(np.full(sums.shape[1], sum(part.shape[1] for part in group) / len(group)))
-        cross = np.concatenate(crosses)
+        self._q, self._bins = q, _bins(tuple(lengths), q == 1)
+        self.walk, count = self._bins.walk, self._bins.count
+        parts = np.split(rows, np.cumsum(lengths)[:-1], axis=1)
+        cross, gone = np.zeros((count.size, q, q)), np.zeros(count.size)
+        for k, begin, ends in self._bins.stretches:
+            C = cosines(parts[k])
+            if q == 1:
+                C[:, 0] = 0.0
+            place = slice(begin, begin + ends.size - 1)
+            for j, row in enumerate(C):
+                cross[place, j, j:] += np.add.reduceat(C[j:] * row, ends[:-1], axis=1).T
+            if absorbed is not None:
+                size = parts[k].shape[1]
+                gone[place] += size * np.diff(np.interp(
+                    np.pi * (ends - 0.5) / size, ABSORBED_AT, absorbed))
         self._cross = (cross + np.triu(cross, 1).transpose(0, 2, 1)).reshape(-1, q * q)
-        self._q, self._n = q, np.concatenate(sizes)
-        self._count, place, sign, gone = np.concatenate(places, axis=1)
         # Number of ordinates not absorbed; at least a tenth, because the absorbed number is only
         # an average.
-        self._left = self._count - np.minimum(gone, 0.9 * self._count)
-        self._effective = self.free - float(np.sum(self._count - self._left))
-        omega = np.pi * place / np.maximum(self._count, 1e-9)
-        self._sign = sign / np.maximum(self._count, 1.0)
-        self._chord = 4.0 * np.sin(0.5 * omega) ** 2
-        # Sum of the squares of an ordinate's weights on the first and the last reading.
-        self._ends = np.where(omega > 0.0, 4.0 - self._chord, 2.0) / self._n
-        # Inverse of the ordinates of a random walk, with a nominal value for the mean (omega 0).
-        self.walk = 4.0 * np.sin(0.5 * np.maximum(omega, 0.5 * np.pi / self._n)) ** 2
+        self._left = count - np.minimum(gone, 0.9 * count)
+        self._effective = self.free - float(np.sum(count - self._left))
 
     @property
     def size(self) -> int:
@@ -186,8 +210,9 @@ class CrossSpectrum:
         # The inverse covariance is (1 - phi)^2 + phi L, whose eigenvectors are the cosines, plus
         # phi (1 - phi) at both ends, which needs Woodbury's formula.
         phi, gap = np.exp(-a), -np.expm1(-a)
-        square = gap * gap + phi * self._chord
-        end = self._ends * phi * gap * (1.0 - self._sign * np.exp(-a * self._n)) / (1.0 + phi)
+        bins = self._bins
+        square = gap * gap + phi * bins.chord
+        end = bins.ends * phi * gap * (1.0 - bins.sign * np.exp(-a * bins.size)) / (1.0 + phi)
         return np.asarray(gap * (1.0 + phi) / square * (1.0 - end / square))
 
     def cost(self, S: FloatArray, used: int | None = None
@@ -197,7 +222,7 @@ class CrossSpectrum:
         # x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
         # Keep the matrices positive definite despite rounding.
-        gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10
+        np.einsum('kii->ki', gram)[...] *= 1.0 + 1e-10
         free, own = self.free, gram
         if used is not None and used < self._q - 1:
             kept = [*range(used), self._q - 1]

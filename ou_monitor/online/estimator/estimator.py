@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
-from ou_monitor.model.ou_fit import known_ou
+from ou_monitor.model.ou_fit import GAP, known_ou
 from ou_monitor.online.estimator.fit import (
-    fit_window, FitEnd, Maximum, MOST, TREND_SCORE, WindowFit)
+    fit_window, FitEnd, JITTER, Maximum, MOST, TREND_SCORE, WindowFit)
 from ou_monitor.online.estimator.quality import examine, input_flags, judge, Quality
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
@@ -54,12 +54,8 @@ MEMORY = 32
 MOST_BLOCK = 1000.0
 # Minimum number of samples for a fit.
 MIN_SAMPLES = 20
-# Minimum length of a run of evenly spaced readings (and longest lag of increments); share of
-# readings in such runs below which the window counts as uneven.
+# Longest lag of increments, readings; minimum share of the readings with such increments.
 _LAGS, _EVEN = 24, 0.5
-# Jitter of the stamps, in relaxation times, above which samples are not treated as evenly spaced:
-# the resulting error would grow with the square of the jitter.
-_JITTER = 0.1
 # Tolerance for rounded stamps at the edge of the window, as a share of the window.
 _ROUNDING = 1e-6
 # If the variance of the increments is below this share of their mean square, the voltage is a
@@ -122,7 +118,6 @@ class SlidingEstimator:
         self._begin = -math.inf
         self._tail = np.empty(0)
         self._quality = Quality()
-        self._jitter = 0.0
         self._looked = -math.inf
         # The last fit, and its last stamp, s.
         self._before: Maximum | None = None
@@ -243,12 +238,10 @@ class SlidingEstimator:
         if t.size:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _ROUNDING) * self._window)
 
-    def _examine(self, t: FloatArray) -> Quality:
+    def _examine(self) -> Quality:
         """Return the quality of the raw samples, examined again several times per window."""
         if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail, self._line.period)
-            steps = np.diff(t[-TAIL:])
-            self._jitter = float(np.std(steps)) if steps.size else 0.0
             self._looked = self._line.newest
         return self._quality
 
@@ -256,7 +249,7 @@ class SlidingEstimator:
         line, kept = self._line, self._kept.columns
         at = int(kept[0].searchsorted(self._begin))
         t, y, u = kept[:, at:]
-        quality = self._examine(t) if t.size else self._quality
+        quality = self._examine() if t.size else self._quality
         counters = line.counters
         if not t.size:
             waiting = self._thinner.waiting(line.newest - self._window)
@@ -301,20 +294,13 @@ class SlidingEstimator:
         steps = np.diff(t)
         usual = float(np.median(steps))
         even = np.abs(steps - usual) <= UNEVEN * usual
-        runs = np.diff(np.flatnonzero(np.concatenate([[True], ~even, [True]])))
-        uneven = runs[runs >= _LAGS].sum() < _EVEN * (t.size - _LAGS)
-        step = float(steps[even].mean()) if even.any() else usual
-
-        def stamps(a: float) -> bool:
-            jitters = math.isfinite(a) and self._jitter * a / step > _JITTER
-            return bool(m == 1 and t.size <= MOST and (uneven or jitters))
-
+        jitter = float(np.std(steps[steps < GAP * usual])) if m == 1 and t.size <= MOST else 0.0
         # If two windows have half of their samples in common, their fits are similar.
         near = t.item(t.size // 2) < self._before_end
         before = self._before if near else None
-        fit, self._before = fit_window(t, y, load, m, quality.step, stamps, before)
+        fit, self._before = fit_window(t, y, load, m, quality.step, jitter, before)
         self._before_end = t.item(-1)
-        if fit.outcome is FitEnd.UNCORRELATED or stamps(fit.alpha_step) or 2 * fit.n < t.size:
+        if fit.outcome is FitEnd.UNCORRELATED or jitter * fit.alpha > JITTER or 2 * fit.n < t.size:
             return fit, NAN
         one, two, far = (_increments(y, even, lag) for lag in (1, 2, _LAGS))
         smoothness = NAN

@@ -328,6 +328,7 @@ class Forecast:
         self._laws: dict[float, tuple[LowestLaw, float, float, float, float]] = {}
         self._kept_drops: dict[float, tuple[float, float]] = {}
         self._kept_flown: dict[float, FlownHorizons] = {}
+        self._kept_state: LoadState | None = None
         for laws in self._by_horizon:
             laws.pending.clear()
             laws.next = laws.learned = -math.inf
@@ -359,6 +360,7 @@ class Forecast:
         self._newest = t.item(-1)
         self._kept_drops.clear()
         self._kept_flown.clear()
+        self._kept_state = None
         self.see(v)
         self._past.push(t, v, u)
 
@@ -395,7 +397,7 @@ class Forecast:
         """Return the OU at the present throttle, from window and load; None if unknown."""
         if not self.estimate.usable:
             return None
-        plain, state = Supply.of(self.estimate), self._loads.state()
+        plain, state = Supply.of(self.estimate), self._present()
         if state is None:
             return plain
         # sigma is an average over the throttles of the window; the load model scales it to the
@@ -422,7 +424,7 @@ class Forecast:
             interval = (self._newest - self._begun) / (self._samples - 1)
             self._sampling = Sampling(interval, self._past.activity())
         due = any(self._newest >= laws.next for laws in self._learning)
-        state = self._loads.state() if self._known and due else None
+        state = self._state() if due else None
         now, passage = self.voltage, self.passage() if due else None
         for laws in self._learning:
             while laws.pending and self._past.end >= laws.pending[0].t + laws.horizon + BLOCK:
@@ -544,7 +546,13 @@ class Forecast:
 
     def _state(self) -> LoadState | None:
         """Return the state from which to predict; None if the load is unknown."""
-        return self._loads.state() if self._known else None
+        return self._present() if self._known else None
+
+    def _present(self) -> LoadState | None:
+        """Return the state of the load filter, computed once for the newest samples."""
+        if self._kept_state is None:
+            self._kept_state = self._loads.state()
+        return self._kept_state
 
 
 # Throttles at which the risk is computed.
