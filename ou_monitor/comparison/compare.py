@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 from ou_monitor.comparison.flight_model import (
-    FiledModel, fit_flight, FlightModel, MOVES, Readings, Simulator)
+    FiledModel, fit_flight, FlightModel, MOVES, Readings)
 from ou_monitor.comparison.yardstick import (
     Agreement, band, differences, distance, judge, Measures, SpectrumBand, Traces, Yardstick)
 from ou_monitor.criticism.adc import without_repeats
@@ -51,7 +51,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     begin = _start_index(samples, fit_until, fitted=model is None)
     if model is None:
         fitted = fit_flight(samples.part(slice(0, begin)), lambda share: report(0.6 * share))
-        simulator: Simulator = fitted
+        simulator: FlightModel | FiledModel = fitted
         notes += _fit_notes(fitted, samples)
     else:
         samples = _checked_load(model, samples, recording.name, notes)
@@ -80,7 +80,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
             report(before * (k + 1) / _FEWEST_SEEDS)
         aligned = _beginning(own.t, np.array(drawn), stride)
     measured: list[Measures] = []
-    traces = np.empty((seeds, -(-own.t.size // stride)), dtype=np.float32)
+    traces = np.empty((seeds, own.voltage[::stride].size), dtype=np.float32)
     total, first = np.zeros(own.t.size), own.voltage
     strays = 0
     for k in range(seeds):
@@ -107,9 +107,43 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')
     path = fitted.path(samples)[part] if model is None else total / seeds
-    return _agreement(recording, own, yardstick, simulator, measured, path, traces, first, notes,
-                      (0.0, float(own.t[0]) if model is None else 0.0), seeds, offset,
-                      (float(own.t[0]), duration))
+    real = yardstick.measure(own.voltage)
+    spread = float(np.ptp(own.voltage))
+    error = path - own.voltage
+    thirds = tuple(float(part.mean()) for part in np.array_split(error, 3))
+    found = differences(yardstick, real, measured, spread, thirds)
+    explained = 1.0 - float(error @ error) / float(
+        np.sum((own.voltage - own.voltage.mean()) ** 2))
+    p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
+        np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0))
+    pooled = np.mean([m.distribution for m in measured], axis=0)
+    responses = np.array([m.response for m in measured])
+    falls = [band(-one.measured, -one.simulated) for one in found if one.kind == 'answer']
+    low, high = np.percentile(traces, [2.5, 97.5], axis=0)
+    empty = np.empty(0)
+    response_low, response_high = (empty, empty) if not responses.size else np.percentile(
+        responses, [2.5, 97.5], axis=0)
+    return Agreement(
+        recording.name, (0.0, float(own.t[0]) if model is None else 0.0),
+        (float(own.t[0]), duration), tuple(simulator.names),
+        explained, math.sqrt(float(np.mean(error ** 2))), round(float(error.mean()), 12),
+        thirds,  # type: ignore[arg-type]
+        found[0].band, found[1].band, tuple(yardstick.levels),
+        tuple(one.band for one in found if one.kind == 'dips'),
+        tuple(SpectrumBand(float(a), float(b), band(
+            math.sqrt(real.power[k]), np.sqrt([m.power[k] for m in measured])))
+            for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
+        None if yardstick.line is None else SpectrumBand(
+            yardstick.line.frequency, yardstick.line.frequency, next(
+                one.band for one in found if one.kind == 'line')),
+        falls[0] if falls else None, falls[1] if falls else None, int(yardstick.rises.size),
+        band(distance(real, pooled), np.array([distance(m, pooled) for m in measured])),
+        seeds, p, verdict, words, farthest, tuple(notes),
+        Traces(own.t + offset, own.voltage,
+               np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
+               own.t[::stride] + offset, low, high, yardstick.after if responses.size else empty,
+               real.response, response_low, response_high, yardstick.edges,
+               real.distribution, pooled))
 
 
 def _beginning(t: FloatArray, drawn: FloatArray, stride: int) -> slice:
@@ -195,47 +229,3 @@ def _checked_load(model: SupplyModel, samples: Readings, name: str, notes: list[
         raise InputError(f"the model's term '{needs[0]}' needs throttle, and the recording has "
                          'none')
     return samples
-
-
-def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simulator: Simulator,
-               measured: list[Measures], path: FloatArray, traces: np.ndarray, first: FloatArray,
-               notes: list[str], fitted: tuple[float, float], seeds: int, offset: float,
-               simulated: tuple[float, float]) -> Agreement:
-    real = yardstick.measure(own.voltage)
-    spread = float(np.ptp(own.voltage))
-    error = path - own.voltage
-    thirds = tuple(float(part.mean()) for part in np.array_split(error, 3))
-    found = differences(yardstick, real, measured, spread, thirds)
-    explained = 1.0 - float(error @ error) / float(
-        np.sum((own.voltage - own.voltage.mean()) ** 2))
-    p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
-        np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0))
-    pooled = np.mean([m.distribution for m in measured], axis=0)
-    responses = np.array([m.response for m in measured])
-    falls = [band(-one.measured, -one.simulated) for one in found if one.kind == 'answer']
-    stride = -(-own.t.size // traces.shape[1])
-    low, high = np.percentile(traces, [2.5, 97.5], axis=0)
-    empty = np.empty(0)
-    response_low, response_high = (empty, empty) if not responses.size else np.percentile(
-        responses, [2.5, 97.5], axis=0)
-    return Agreement(
-        recording.name, fitted, simulated, tuple(simulator.names),
-        explained, math.sqrt(float(np.mean(error ** 2))), round(float(error.mean()), 12),
-        thirds,  # type: ignore[arg-type]
-        band(real.lowest, np.array([m.lowest for m in measured])),
-        band(real.mean, np.array([m.mean for m in measured])), tuple(yardstick.levels),
-        tuple(one.band for one in found if one.kind == 'dips'),
-        tuple(SpectrumBand(float(a), float(b), band(
-            math.sqrt(real.power[k]), np.sqrt([m.power[k] for m in measured])))
-            for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
-        None if yardstick.line is None else SpectrumBand(
-            yardstick.line.frequency, yardstick.line.frequency,
-            band(real.line, np.array([m.line for m in measured]))),
-        falls[0] if falls else None, falls[1] if falls else None, int(yardstick.rises.size),
-        band(distance(real, pooled), np.array([distance(m, pooled) for m in measured])),
-        seeds, p, verdict, words, farthest, tuple(notes),
-        Traces(own.t + offset, own.voltage,
-               np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
-               own.t[::stride] + offset, low, high, yardstick.after if responses.size else empty,
-               real.response, response_low, response_high, yardstick.edges,
-               real.distribution, pooled))

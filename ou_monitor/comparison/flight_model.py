@@ -14,13 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
-from typing import Protocol
 
 import numpy as np
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.model.arma import theta_at
 from ou_monitor.model.innovations import Filter, StateSpace
-from ou_monitor.model.load import lowpass
+from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.load_fit import fit_load, level_evidence, LoadFit, SLOW_TIME
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.ou_fit import (
@@ -61,17 +60,6 @@ class Readings:
         return find_step(self.voltage)
 
 
-class Simulator(Protocol):
-    """A model that can be simulated over the stamps, throttle and current of a recording."""
-
-    @property
-    def names(self) -> list[str]:
-        """Return the names of its terms."""
-
-    def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
-        """Return one simulated voltage, V, before the ADC."""
-
-
 @dataclass(frozen=True)
 class Damping:
     """The share of fast changes of a path that the voltage does not follow."""
@@ -83,8 +71,6 @@ class Damping:
 
     def of(self, path: FloatArray, t: FloatArray) -> FloatArray:
         """Return a path, V, at stamps, s, damped."""
-        if not self.share > 0.0:
-            return path
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
@@ -202,32 +188,27 @@ class FlightModel:
         """Return the mean voltage, V."""
         if self.load is None:
             return np.full(samples.t.size, self.level)
-        path = self.load.model.path(samples.t, samples.throttle, samples.current)
+        path = _path(samples, self.load.model)
         if self.other is not None:
-            path = path + self.doubt * (self.other.model.path(
-                samples.t, samples.throttle, samples.current) - path)
+            path = path + self.doubt * (_path(samples, self.other.model) - path)
         return self.damping.of(path, samples.t)
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V; the errors of the parameters are drawn too."""
         n = samples.t.size
-        slow = 0.0
         if self.load is None:
             voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
         else:
             other = None if rng.random() >= self.doubt else self.other
             load = (other or self.load).draw(rng)
-            path = load.path(samples.t, samples.throttle, samples.current)
+            path = _path(samples, load)
             size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
-            resized = replace(load, size=size).path(
-                samples.t, samples.throttle, samples.current)
+            resized = _path(samples, replace(load, size=size))
             # The mean over the fitted part is known, so with a larger sag the level is higher.
             path = resized - float((resized - path)[samples.t <= self.until].mean())
-            voltage = self.damping.of(path, samples.t)
-            slow = self.load.slow_std ** 2
-        if slow > 0.0:
-            voltage = voltage + simulate(
-                samples.t, 1.0 / SLOW_TIME, math.sqrt(2.0 * slow / SLOW_TIME), rng)
+            voltage = self.damping.of(path, samples.t) + simulate(
+                samples.t, 1.0 / SLOW_TIME,
+                math.sqrt(2.0 * self.load.slow_std ** 2 / SLOW_TIME), rng)
         return np.asarray(voltage + self.noise.draw(
             n, _simulated_load(self.load, samples), rng))
 
@@ -273,69 +254,48 @@ _FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightModel:
     """Fit a model to samples: at least 100, over several seconds (report: progress, 0..1)."""
     mean = float(samples.voltage.mean())
-    best = _best(samples, lambda share: report(0.4 * share))
-    held_out = []
-    if best is not None:
+    load, other, doubt = _best(samples, lambda share: report(0.4 * share)) or (None, None, 0.0)
+    held_out, damped, path = [], Damping(), np.full(samples.t.size, mean)
+    if load is not None:
         for j in range(_PARTS):
             part = slice(*(k * samples.t.size // _PARTS for k in (j, j + 1)))
-            fit = _fit(samples, best.current, best.constant_level, part, best.fit)
-            held_out.append((_path(samples, fit, best.current)[part], samples.voltage[part]))
+            fit = _fit(samples, load.model.full_current != 0.0,
+                       math.isfinite(load.model.constant_level), part, load)
+            held_out.append((_path(samples, fit.model)[part], samples.voltage[part]))
             report(0.4 + 0.5 * (j + 1.0) / _PARTS)
-    load = None if best is None else best.fit
-    path = np.full(samples.t.size, mean) if best is None else _path(
-        samples, best.fit, best.current)
-    damped = Damping() if load is None else damping(samples, path)
+        path = _path(samples, load.model)
+        damped = damping(samples, path)
     noise = fit_noise(samples, samples.voltage - damped.of(path, samples.t),
                       _simulated_load(load, samples),
                       0.0 if load is None else load.slow_std ** 2)
     duration = float(samples.t[-1] - samples.t[0])
     report(1.0)
-    return FlightModel(
-        load, None if best is None else best.other, 0.0 if best is None else best.doubt,
-        mean, noise.mean_error(duration), damped,
-        _sag_error(held_out), noise, float(samples.t[-1]))
+    return FlightModel(load, other, doubt, mean, noise.mean_error(duration), damped,
+                       _sag_error(held_out), noise, float(samples.t[-1]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
-    """A load and its fit."""
-
-    fit: LoadFit
-    current: FloatArray | None
-    constant_level: bool
-    other: LoadFit  # Fit with the other kind of level
-    doubt: float  # Probability of the other kind of level
-
-
-def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
-    """Return the load with most evidence; None if none has clearly more than a level alone."""
-    found: _Load | None = None
+def _best(samples: Readings, report: Callable[[float], None],
+          ) -> tuple[LoadFit, LoadFit, float] | None:
+    """Return the fit of the load, the fit with the other kind of level, and its probability."""
+    # None if no load has clearly more evidence than a level alone.  The simpler load comes first:
+    # throttle before current.
+    found: tuple[LoadFit, LoadFit, float] | None = None
     most = level_evidence(samples.t, samples.voltage)
-    # The simpler load comes first: throttle before current.
-    loads = _loads(samples)
-    for k, current in enumerate(loads):
-        constant, falling = (_fit(samples, current, kind) for kind in (True, False))
+    loads = [by_current for by_current, x, least in (
+        (False, samples.throttle, MOVES), (True, samples.current, 1e-300))
+        if x is not None and np.ptp(x) >= least]
+    for k, by_current in enumerate(loads):
+        constant, falling = (_fit(samples, by_current, kind) for kind in (True, False))
         ahead = falling.evidence - constant.evidence
         evidence = float(np.logaddexp(falling.evidence, constant.evidence)) - math.log(2.0)
         if evidence > most + _CLEAR:
             fit, other = (falling, constant) if ahead > 0.0 else (constant, falling)
-            found, most = _Load(fit, current, ahead <= 0.0, other,
-                                float(expit(-abs(ahead)))), evidence
+            found, most = (fit, other, float(expit(-abs(ahead)))), evidence
         report((k + 1.0) / len(loads))
     return found
 
 
-def _loads(samples: Readings) -> list[FloatArray | None]:
-    """Return the loads that change: throttle (as None), and current."""
-    found: list[FloatArray | None] = []
-    if samples.throttle is not None and np.ptp(samples.throttle) >= MOVES:
-        found.append(None)
-    if samples.current is not None and np.ptp(samples.current) > 0.0:
-        found.append(samples.current)
-    return found
-
-
-def _fit(samples: Readings, current: FloatArray | None, constant_level: bool,
+def _fit(samples: Readings, by_current: bool, constant_level: bool,
          without: slice | None = None, near: LoadFit | None = None) -> LoadFit:
     """Fit the load; with very many samples, to means of neighbours."""
     width = -(-samples.t.size // _MOST)
@@ -349,12 +309,12 @@ def _fit(samples: Readings, current: FloatArray | None, constant_level: bool,
     return fit_load(
         mean(samples.t), mean(samples.voltage),
         None if samples.throttle is None else mean(samples.throttle),
-        None if current is None else mean(current), constant_level=constant_level,
-        left_out=left_out, near=near)
+        mean(samples.current) if by_current and samples.current is not None else None,
+        constant_level=constant_level, left_out=left_out, near=near)
 
 
-def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatArray:
-    return fit.model.path(samples.t, samples.throttle, current)
+def _path(samples: Readings, model: LoadModel) -> FloatArray:
+    return model.path(samples.t, samples.throttle, samples.current)
 
 
 def damping(samples: Readings, path: FloatArray) -> Damping:

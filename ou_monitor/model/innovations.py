@@ -100,16 +100,13 @@ class Filter:
         columns = y[:, None] if y.ndim == 1 else y
         length = self._gain.shape[0]
         if length == self._n:
-            e = self._through(columns)
+            e, _ = self._states(columns)
         else:
             e = np.empty_like(columns, dtype=np.float64)
             e[:length], state = self._states(columns[:length])
             # Start with the state of the last sample but one, whose gain is the constant gain.
             e[length - 1:] = self._steady.innovations(columns[length - 1:], state[-2])
         return e[:, 0] if y.ndim == 1 else e
-
-    def _through(self, columns: FloatArray) -> FloatArray:
-        return self._states(columns)[0]
 
     def _states(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return innovations and filtered states of samples with their own gain."""
@@ -122,29 +119,25 @@ class Filter:
         return e, state
 
 
-# Maximum condition number of the eigenvectors for filtering the modes one by one.
-_DISTINCT = 1e10
-# Number of samples filtered at once if the modes cannot be filtered one by one.
-_CHUNK = 4096
+# Maximum condition number of the eigenvectors; beyond it, the loop is disturbed by this share.
+_DISTINCT, _NUDGE = 1e10, 1e-9
 
 
 class _SteadyFilter:
-    """A filter with constant gain, run mode by mode if the modes are distinct."""
+    """A filter with constant gain, run mode by mode."""
 
     def __init__(self, loop: FloatArray, gain: FloatArray, look: FloatArray) -> None:
-        self._loop, self._gain, self._look = loop, gain, look
         self._roots, vectors = np.linalg.eig(loop)
-        self._modal = bool(np.linalg.cond(vectors) < _DISTINCT)
-        if self._modal:
-            self._into = np.linalg.inv(vectors)
-            self._drive = self._into @ gain
-            self._seen = look @ vectors
+        if np.linalg.cond(vectors) > _DISTINCT:
+            # Equal modes have no complete set of eigenvectors.
+            self._roots, vectors = np.linalg.eig(loop * (1.0 - _NUDGE * np.arange(gain.size)))
+        self._into = np.linalg.inv(vectors)
+        self._drive = self._into @ gain
+        self._seen = look @ vectors
 
     def innovations(self, columns: FloatArray, state: FloatArray) -> FloatArray:
         """Return the innovations after a filtered state of shape (d, p)."""
         e = columns.astype(np.float64)
-        if not self._modal:
-            return self._in_chunks(e, state)
         modes = self._into @ state
         for root, drive, seen, before in zip(self._roots, self._drive, self._seen, modes):
             if abs(seen * drive) == 0.0 or root.imag < 0.0:
@@ -158,32 +151,10 @@ class _SteadyFilter:
             e[1:] -= (seen * kept[:-1]).real
         return e
 
-    def _in_chunks(self, e: FloatArray, state: FloatArray) -> FloatArray:
-        d = self._gain.size
-        for begin in range(0, e.shape[0], _CHUNK):
-            part = e[begin:begin + _CHUNK].copy()
-            m = part.shape[0]
-            right = self._gain[None, :, None] * part[:, None, :]
-            right[0] += self._loop @ state
-            loops = np.broadcast_to(self._loop[:, :, None], (d, d, m - 1))
-            band = _band(_identity(d, m), -loops)
-            states = dtbtrs(band, right.reshape(m * d, -1), uplo='L', diag='U')[0].reshape(
-                m, d, -1)
-            before = np.concatenate((state[None], states[:-1]))
-            e[begin:begin + m] -= np.einsum('d,mdp->mp', self._look, before)
-            state = states[-1]
-        return e
-
 
 def _elements(a: FloatArray) -> FloatArray:
     """Return a stack of matrices, shape (n, d, d), as shape (d, d, n)."""
     return np.ascontiguousarray(a.transpose(1, 2, 0))
-
-
-def _identity(d: int, n: int) -> FloatArray:
-    """Return n unit matrices, shape (d, d, n)."""
-    one: FloatArray = np.broadcast_to(np.eye(d)[:, :, None], (d, d, n))
-    return one
 
 
 Pattern = npt.NDArray[np.bool_]

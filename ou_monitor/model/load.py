@@ -166,8 +166,6 @@ LAGS = (0.06, 0.35, 2.0, 15.0)
 LINEAR_LAGS = (0.35, 2.0)
 # Number of coefficients: of x = u^1.8, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush.
 SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
-# Indices of the coefficients of old model files, which lack x after 0.35 s and u after lags.
-_FORMER = (0, 1, 2, 3, 5, 6, SIZE - 1)
 # Number of fields at the end of LoadStart that a model file may omit.
 _OPTIONAL = 9
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
@@ -240,27 +238,9 @@ class LoadStart:
         if missing:
             raise ValueError(f"the load lacks '{missing[0]}'")
         try:
-            return cls(**_present({name: _numbers(value) for name, value in values.items()}))
+            return cls(**{name: _numbers(value) for name, value in values.items()})
         except TypeError as error:
             raise ValueError(f'the load must hold numbers and lists of them: {error}') from error
-
-
-def _present(values: dict[str, Any]) -> dict[str, Any]:
-    """Add the coefficients that an old file lacks: zero, with their prior variance."""
-    try:
-        a, P = np.array(values['coefficients']), np.array(values['covariance'])
-    except ValueError:
-        return values
-    n = len(_FORMER)
-    if a.shape != (n,) or P.shape != (n, n):
-        return values
-    place = np.array(_FORMER)
-    full = np.diag(usual_coefficients()[1].diagonal()) * values['volts'] ** 2
-    full[np.ix_(place, place)] = P
-    mean = np.zeros(SIZE)
-    mean[place] = a
-    return values | {'coefficients': tuple(mean.tolist()),
-                     'covariance': tuple(tuple(row) for row in full.tolist())}
 
 
 def _numbers(value: Any) -> Any:

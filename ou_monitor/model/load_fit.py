@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import CELL, cells_in_series, charge_at, LoadModel, lowpass
+from ou_monitor.model.load import cells_in_series, charge_at, LoadModel, lowpass
 from ou_monitor.model.ou import first_order
-from ou_monitor.records import determined, FloatArray, log_interval, NAN
+from ou_monitor.records import FloatArray, NAN
 from scipy.optimize import least_squares
 
 # Prior centre and standard deviation of each parameter (of its logarithm unless in _LINEAR): usual
@@ -78,15 +78,6 @@ class LoadFit:
         low, high, _, _ = _bounds(self.model)
         moved = rng.multivariate_normal(_theta(self.model), self.covariance)
         return _moved(self.model, np.clip(moved, low, high))
-
-    @property
-    def resistance(self) -> tuple[float, float, float]:
-        """Return resistance, Ohm, and its 95 % interval, statistical only; NaN without current."""
-        if not self.model.full_current:
-            return NAN, NAN, NAN
-        value = self.model.size * self.model.cells * CELL / abs(self.model.full_current)
-        low, high = log_interval(value, math.sqrt(self.covariance[0, 0]))
-        return value if determined(value, low, high) else NAN, low, high
 
 
 def _theta(model: LoadModel) -> FloatArray:

@@ -52,7 +52,6 @@ class LoadDependentSigma(Term):
         return len(self.throttle) == 2 and self.throttle[1] - self.throttle[0] < 3.0 * _EDGE
 
     def change(self, s: Segment) -> None:
-        """Multiply sigma."""
         s.sigma *= np.exp(np.interp(s.throttle, self.throttle, self.log_factor))
 
     def free(self) -> tuple[str, ...]:
@@ -60,14 +59,12 @@ class LoadDependentSigma(Term):
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
-        """Return the term with the log factor at one knot changed."""
         at = int(name.split()[1])
         factors = tuple(min(max(f + by, -_MOST), _MOST) if k == at else f
                         for k, f in enumerate(self.log_factor))
         return replace(self, log_factor=factors)
 
     def per_coordinate(self, name: str) -> float:
-        """Return 1: the value at a knot is already a logarithm."""
         return 1.0
 
     @classmethod
@@ -197,15 +194,12 @@ class LoadDependentAlpha(Term):
     slope: float = parameter('', 'ln of the factor at full throttle')
 
     def change(self, s: Segment) -> None:
-        """Multiply alpha."""
         s.alpha *= np.exp(self.slope * s.throttle)
 
     def moved(self, name: str, by: float) -> LoadDependentAlpha:
-        """Return the term with its slope moved."""
         return replace(self, slope=self.slope + by)
 
     def per_coordinate(self, name: str) -> float:
-        """Return 1: the slope is itself the coordinate."""
         return 1.0
 
     @classmethod
@@ -326,7 +320,6 @@ class LoadDependentNoise(Term):
             for k, (at, log) in self.curves().items()}
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         inputs = Inputs(self.curves())
 
         def effect(s: Segment) -> None:

@@ -55,7 +55,6 @@ class LoadSag(Term):
     growth: float = parameter('V/s', 'growth of the linear part', default=0.0)
 
     def change(self, s: Segment) -> None:
-        """Lower the level."""
         linear = self.linear + self.growth * (s.at - s.origin)
         s.level -= (linear + self.square * s.throttle) * s.throttle
 
@@ -132,7 +131,6 @@ class LoadTransient(Term):
         return (kind.MEANING, kind.REMEDY) if self.delay else _ABOUT[self.tau > _INRUSH, late]
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         slow: dict[int, float] = {}
         times = np.empty(0)
         values = np.empty(0)

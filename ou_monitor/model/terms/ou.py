@@ -42,7 +42,6 @@ class OU(Term):
     u0: float = parameter('V', 'level')
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         before = 0.0
         parts = rng.spawn(1)[0]
 
@@ -179,7 +178,6 @@ class NonlinearRestoring(Term):
                              'diverges')
 
     def change(self, s: Segment) -> None:
-        """Add the nonlinear coefficients to the force."""
         s.bend = (s.bend[0] + self.square, s.bend[1] + self.cube)
 
     @classmethod

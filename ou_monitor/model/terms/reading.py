@@ -38,7 +38,6 @@ class MeasurementNoise(Term):
     std: float = parameter('V', 'standard deviation', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         def effect(s: Segment) -> None:
             draws = rng.standard_normal(s.t.size)
             for shape in s.shape:
@@ -58,11 +57,9 @@ class MeasurementNoise(Term):
         return self.variance() > _LEAST * float(np.median(view.variance))
 
     def variance(self) -> float:
-        """Return the variance that this term adds to each measurement, V^2."""
         return self.std * self.std
 
     def variances(self, s: Segment) -> FloatArray | float:
-        """Return the variance at each sample, V^2."""
         return self.variance() * np.square(s.noise)
 
 
@@ -102,7 +99,6 @@ class LopsidedNoise(Term):
                             above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         mean, std = _moments(self.skew, self.tail)
 
         def effect(s: Segment) -> None:
@@ -197,11 +193,9 @@ class Quantization(Term):
     step: float = parameter('V', 'resolution, one code', 0.0, above=True)
 
     def change(self, s: Segment) -> None:
-        """Round the readings."""
         s.voltage = self.step * np.rint(s.voltage / self.step)
 
     def variance(self) -> float:
-        """Return the variance of the rounding, V^2."""
         return self.step * self.step / 12.0
 
 
@@ -228,7 +222,6 @@ class Saturation(Term):
                              f'{self.high:g} V')
 
     def change(self, s: Segment) -> None:
-        """Clip the readings."""
         np.clip(s.voltage, self.low, self.high, out=s.voltage)
 
 
@@ -248,7 +241,6 @@ class HeldSamples(Term):
     rate: float = parameter('Hz', 'update rate of the source', 0.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         last = 0.0
         turn = -1.0
 
@@ -283,7 +275,6 @@ class ClockJitter(Term):
     std: float = parameter('s', 'standard deviation of the error of a stamp', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         last = -math.inf
         stamp = -math.inf
 
@@ -320,7 +311,6 @@ class ClockJitter(Term):
         return cls._best_fit(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit again, starting from these parameters."""
         return self._best_fit(
             view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
 
@@ -368,7 +358,6 @@ class JitterOnLines(ClockJitter):
         return self.std * view.rate < _MOST_ERROR
 
     def variances(self, s: Segment) -> FloatArray:
-        """Return the variance at each sample, V^2."""
         return np.square(self.std * s.slope)
 
 

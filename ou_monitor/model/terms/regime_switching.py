@@ -386,7 +386,6 @@ class RegimeSwitching(Term):
             raise ValueError(f'{self.NAME}.states must be 2 or 3, got {self.states:g}')
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         count = int(self.states)
         rates = rates_between(self.rate_up, self.rate_down, count)
         law, leave = stationary_law(rates), rates.sum(axis=1)
@@ -497,7 +496,6 @@ class RegimeSwitching(Term):
         return found
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit again, starting from these parameters."""
         unit = math.sqrt(float(np.median(view.variance)))
         ratio = math.log(max(self.sigma_ratio, 1e-2))
         states = int(self.states)

@@ -45,7 +45,6 @@ class Jumps(Term):
     std: float = parameter('V', 'standard deviation of the size', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         waits, sizes = rng.spawn(2)
         next_at = math.nan
 
@@ -160,7 +159,6 @@ class Glitches(Term):
     std: float = parameter('V', 'standard deviation of the error', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         turns, sizes = rng.spawn(2)
 
         def effect(s: Segment) -> None:
@@ -344,7 +342,6 @@ class HeavyTails(Term):
     dof: float = parameter('', 'degrees of freedom', 2.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         def effect(s: Segment) -> None:
             s.power *= (self.dof - 2.0) / (2.0 * rng.standard_gamma(0.5 * self.dof, s.t.size))
 

@@ -44,7 +44,6 @@ class Drift(Term):
     charge: float = parameter('V/s', 'slope added at full throttle', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         drawn = 0.0
 
         def effect(s: Segment) -> None:
@@ -98,7 +97,6 @@ class SecondRelaxation(Term):
     sigma: float = parameter('V/sqrt(s)', 'its noise intensity', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         before = 0.0
 
         def effect(s: Segment) -> None:
@@ -126,7 +124,6 @@ class SecondRelaxation(Term):
         return _LEAST / float(view.at[-1]) < self.alpha < _LEAST * view.rate
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the state of the second OU."""
         phi = np.exp(-self.alpha * s.step)
         q = self.sigma * self.sigma * -np.expm1(-2.0 * self.alpha * s.step) / (2.0 * self.alpha)
         return phi[:, None, None], q[:, None, None], np.ones(1)
@@ -196,7 +193,6 @@ class FlickerNoise(Term):
         return 2.0 * math.pi * _CORNER * self.high
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         poles, std, rate = self.poles(), self.pole_std(), self.corner
         *sources, last = rng.spawn(poles.size + 1)
         before, low = np.zeros(poles.size), math.nan
@@ -335,7 +331,6 @@ class ACCoupling(Term):
     offset: float = parameter('V', 'mean level of the readings')
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         low = x_before = level_before = math.nan
         rate = 2.0 * math.pi * self.corner
 

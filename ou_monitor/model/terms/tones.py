@@ -50,7 +50,6 @@ class Tone(Term):
     linewidth: float = parameter('Hz', 'width of the line; 0: a pure tone', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         wander = phase_noise(self.linewidth, rng)
 
         def effect(s: Segment) -> None:
@@ -83,7 +82,6 @@ class Tone(Term):
             or not power_spread(view, self.frequency, self.linewidth) > CONSTANT)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the two rotating states of a line whose phase wanders."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, math.pi * self.linewidth, s.step, self.amplitude / math.sqrt(2.0))
 
@@ -98,11 +96,9 @@ class Tone(Term):
         return np.stack(columns, axis=1)
 
     def linear_values(self) -> list[float]:
-        """Return the coefficients of the columns."""
         return [self.amplitude * math.cos(self.phase), self.amplitude * math.sin(self.phase)]
 
     def with_linear(self, beta: Sequence[float]) -> Tone:
-        """Return the tone with these coefficients."""
         return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))
 
 
@@ -163,17 +159,14 @@ class Resonance(Term):
     tilt: float = parameter('', 'slope of the spectrum: 1 low-pass, -1 band-pass', -1.0, 1.0)
 
     def moved(self, name: str, by: float) -> Resonance:
-        """Return the term with one coordinate moved: the tilt, or the logarithm of another."""
         if name != 'tilt':
             return super().moved(name, by)
         return replace(self, tilt=min(max(self.tilt + by, -_STEEPEST), _STEEPEST))
 
     def per_coordinate(self, name: str) -> float:
-        """Return the derivative of a parameter with respect to its coordinate."""
         return 1.0 if name == 'tilt' else super().per_coordinate(name)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         before = 0.0 + 0.0j
 
         def effect(s: Segment) -> None:
@@ -206,7 +199,6 @@ class Resonance(Term):
                 for tilt in (0.0, -_STEEP, _STEEP)]
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the two rotating states of the ringing."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, self.damping, s.step, self.std,
                         self.tilt * self.damping / (2.0 * math.pi * self.frequency))
@@ -251,7 +243,6 @@ class ThrottleTone(Term):
     linewidth: float = parameter('Hz', 'width of the line; 0: it follows throttle exactly', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         turns = 0.0
         wander = phase_noise(self.linewidth, rng)
 
@@ -281,7 +272,6 @@ class ThrottleTone(Term):
             abs(self.slope) * float(view.throttle[view.train].std()) > _MORE * self.linewidth)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return two states, which rotate at the frequency for the throttle."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
         turn = 2.0 * math.pi * (self.idle + self.slope * s.throttle) * step
         damping = math.pi * max(self.linewidth, _NARROWEST)

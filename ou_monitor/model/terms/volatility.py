@@ -37,7 +37,6 @@ class Volatility(Term):
     rate: float = parameter('1/s', 'relaxation rate of ln sigma', 0.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
         before = 0.0
 
         def effect(s: Segment) -> None:
@@ -57,7 +56,6 @@ class Volatility(Term):
         return cls._best_fit(view, _start(view), known=False)
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit again, starting from these parameters."""
         return self._best_fit(view, np.array([
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
