@@ -31,7 +31,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import threading
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -50,8 +49,10 @@ _LEAD = 1.0
 # Nodes added at each end of each axis, so that the ends do not affect the splines.
 _PAD = 5
 
-T = TypeVar('T')
 _LOG_TWO_PI = math.log(2.0 * math.pi)
+# Long-run rate, 1/tau, for barriers from -6 to 0, as a polynomial of the barrier: within 0.04 % of
+# the smallest eigenvalue; less than 2e-4 of such paths outlast the table.
+_LOW_RATE = (-1.98242460e-04, -4.29510921e-03, 2.01687905e-01, -7.93135812e-01, 1.00086922)
 # Barrier above which the mean time, more than 1e145 tau, counts as infinite.
 _NEVER = 26.0
 
@@ -294,11 +295,11 @@ def _log_rate(b: FloatArray) -> FloatArray:
     # D is the parabolic cylinder function.  For 0 < b <= 8, nu comes from the power series of the
     # Hermite function, in which only the first term is negative: nu = 2 Gamma(1 - nu/2) / sum over
     # n >= 1 of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, nu comes from the asymptotic
-    # series of the mean time, 1/nu; for b <= 0, from `_lowest_energy`.
+    # series of the mean time, 1/nu.
     result = np.empty(b.size)
     n = range(1, 260)
 
-    def excess(log_nu: float, log_terms: list[float]) -> float:
+    def excess(log_nu: float) -> float:
         nu = math.exp(log_nu)
         logs = [term + math.lgamma(0.5 * (k - nu)) for k, term in zip(n, log_terms, strict=True)]
         top = max(logs)
@@ -307,10 +308,10 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
     for k, barrier in enumerate(b.tolist()):
         if barrier <= 0.0:
-            result[k] = math.log(_lowest_energy(barrier))
+            result[k] = math.log(np.polyval(_LOW_RATE, barrier))
         elif barrier <= 8.0:
-            result[k] = _root(excess, [j * math.log(math.sqrt(2.0) * barrier)
-                                       - math.lgamma(j + 1.0) for j in n], -40.0, -1e-12)
+            log_terms = [j * math.log(math.sqrt(2.0) * barrier) - math.lgamma(j + 1.0) for j in n]
+            result[k] = _root(excess, -40.0, -1e-12)
         else:
             z = 1.0 / (barrier * barrier)
             result[k] = (math.log(barrier) - 0.5 * barrier * barrier - 0.5 * _LOG_TWO_PI
@@ -318,30 +319,13 @@ def _log_rate(b: FloatArray) -> FloatArray:
     return result
 
 
-def _lowest_energy(barrier: float) -> float:
-    """Return the smallest eigenvalue nu of -f'' + (x^2/4 - 1/2) f = nu f."""
-    # f is exp(-x^2/4) times the solution of the backward equation; it is zero at the barrier and
-    # far below the barrier.  Collocation at Chebyshev points: Trefethen, Spectral Methods in
-    # MATLAB, 2000, program 6.
-    order, length = 64, 14.0
-    x = np.cos(math.pi * np.arange(order + 1) / order)
-    c = np.ones(order + 1)
-    c[[0, -1]] = 2.0
-    c[1::2] *= -1.0
-    slopes = np.outer(c, 1.0 / c) / (x[:, None] - x + np.eye(order + 1))
-    slopes -= np.diag(slopes.sum(axis=1))
-    place = barrier + 0.5 * length * (x - 1.0)
-    energy = np.diag(0.25 * place**2 - 0.5) - (2.0 / length) ** 2 * slopes @ slopes
-    return float(np.linalg.eigvals(energy[1:-1, 1:-1]).real.min())
-
-
-def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:
+def _root(f: Callable[[float], float], low: float, high: float) -> float:
     """Return the zero between two ends, to 1e-12, by the Illinois method (without SciPy)."""
-    f_low, f_high = f(low, argument), f(high, argument)
+    f_low, f_high = f(low), f(high)
     side = 0
     while True:
         middle = (f_high * low - f_low * high) / (f_high - f_low)
-        value = f(middle, argument)
+        value = f(middle)
         if value * f_high > 0.0:
             moved, high, f_high = high - middle, middle, value
             f_low *= 0.5 if side == 1 else 1.0
