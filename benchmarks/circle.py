@@ -20,7 +20,7 @@ from common import arguments, BENCHES, deliver, FLIGHTS, HIRO, recorded, say, ta
 import numpy as np
 from ou_monitor import compare, discover, read_recording, Recording, simulate
 from ou_monitor.cli.recorded import model_text
-from ou_monitor.comparison.yardstick import Likeness
+from ou_monitor.comparison.compare import Likeness
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.recordings.model_file import read_model

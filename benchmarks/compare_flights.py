@@ -10,8 +10,7 @@ import sys
 import time
 
 from common import arguments, deliver, flights, say, table
-from ou_monitor.comparison.compare import compare
-from ou_monitor.comparison.yardstick import Agreement, Band
+from ou_monitor.comparison.compare import Agreement, Band, compare
 
 HEAD = ['flight', 's', 'explained', 'bias mV', 'lowest V', 'simulated', 'dips 1 %', 'simulated',
         'dips 5 %', 'simulated', 'verdict', 'CPU s']

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentSigma
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadDependentSigma, LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift

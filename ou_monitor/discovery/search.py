@@ -26,9 +26,8 @@ from ou_monitor.discovery.gain import BLOCKS
 from ou_monitor.discovery.regression import load_terms, mean_response
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent import (
-    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import (
+    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma, LoadSag, LoadTransient)
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import ACCoupling

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.comparison.yardstick import Agreement, LEVEL, Likeness
+from ou_monitor.comparison.compare import Agreement, LEVEL, Likeness
 from ou_monitor.records import FloatArray
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)

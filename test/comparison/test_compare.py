@@ -4,9 +4,8 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.comparison.compare import compare
+from ou_monitor.comparison.compare import compare, Likeness
 from ou_monitor.comparison.flight_model import _sag_error, damping, fit_flight, Readings
-from ou_monitor.comparison.yardstick import Likeness
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.supply import SupplyModel

@@ -2,9 +2,9 @@
 
 import numpy as np
 from ou_monitor.analysis.supply import supply_facts
-from ou_monitor.comparison.flight_model import Readings
-from ou_monitor.comparison.yardstick import (
+from ou_monitor.comparison.compare import (
     band, between_codes, Difference, differences, judge, Likeness, Yardstick)
+from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.records import Recording
 import pytest
 from scipy.stats import norm

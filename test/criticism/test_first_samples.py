@@ -7,8 +7,7 @@ from numpy.testing import assert_allclose
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import columns_of, evaluate, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
-from ou_monitor.model.terms.load_dependent import LoadDependentAlpha
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import ACCoupling
 

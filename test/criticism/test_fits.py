@@ -13,8 +13,8 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
+from ou_monitor.model.terms.shocks import Volatility
 from ou_monitor.model.terms.slow import FlickerNoise, SecondRelaxation
-from ou_monitor.model.terms.volatility import Volatility
 from ou_monitor.model.whittle import Ordinates
 import pytest
 from scipy.signal import lfilter

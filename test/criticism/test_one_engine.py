@@ -22,7 +22,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.model.spectral_lines import find_lines, on_grid
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentAlpha, LoadDependentSigma
+from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import ACCoupling, SecondRelaxation

@@ -10,7 +10,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.gain import guess
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Quantization
-from ou_monitor.model.terms.volatility import Volatility
+from ou_monitor.model.terms.shocks import Volatility
 import pytest
 from scipy.signal import lfilter
 from scipy.special import ndtr

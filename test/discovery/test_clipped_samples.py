@@ -10,8 +10,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.discover import _start, _without_clipping
 from ou_monitor.discovery.redraw import redraw_clipped
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentSigma
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import LoadDependentSigma, LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Saturation
 import pytest

@@ -12,8 +12,7 @@ from ou_monitor.discovery.fitting import with_reach
 from ou_monitor.discovery.words import parameters
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentSigma
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadDependentSigma, LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.tones import Tone

@@ -11,8 +11,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.gain import blocks_of, covered, gain_of, held_out
 from ou_monitor.discovery.load_effects import low_dips
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentSigma
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import LoadDependentSigma, LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import Jumps

@@ -6,11 +6,10 @@ import re
 
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.words import (
-    both_names, cause_rows, coupling_note, explain, gain_text, gain_words, input_words,
-    parameters, plain, PLAIN_NAMES, plain_words, verdict_words, with_error)
+    both_names, cause_rows, coupling_note, explain, gain_text, gain_words, input_words, parameters,
+    plain, PLAIN_NAMES, plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent import LoadDependentNoise
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadDependentNoise, LoadSag, LoadTransient
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.tones import Tone

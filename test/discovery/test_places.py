@@ -6,8 +6,8 @@ import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.discovery.gain import errors_grow
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import Inputs, INPUTS, LoadDependentNoise
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import (
+    Inputs, INPUTS, LoadDependentNoise, LoadSag, LoadTransient)
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.term import View

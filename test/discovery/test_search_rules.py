@@ -11,8 +11,7 @@ from ou_monitor.discovery.fitting import Fitter, Trial
 from ou_monitor.discovery.named import _with_trends
 from ou_monitor.discovery.search import Search
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import LoadDependentNoise, LoadDependentSigma, LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation

@@ -7,9 +7,8 @@ from ou_monitor import discover, Recording
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.search import backward, Search
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import (
-    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import (
+    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma, LoadSag)
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.terms.load_dependent import LoadDependentSigma
+from ou_monitor.model.terms.load_response import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
     _SLOW_AHEAD, _slow_levels, RegimeSwitching, relaxing)
 from ou_monitor.model.terms.term import View

@@ -8,8 +8,7 @@ import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor
 from ou_monitor.model.load import WARMING, WARMING_SE
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent import LoadDependentNoise
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadDependentNoise, LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift

@@ -9,9 +9,8 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.shocks import Jumps
+from ou_monitor.model.terms.shocks import Jumps, Volatility
 from ou_monitor.model.terms.tones import Tone
-from ou_monitor.model.terms.volatility import Volatility
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 import pytest
