@@ -111,7 +111,6 @@ def _default_voltage(recording: Recording) -> float:
 
 
 def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, ...]:
-    """Return notes on the parts that belong to no level."""
     if not recording.n:
         return ('The recording holds no samples.',)
     if not recording.has_throttle:

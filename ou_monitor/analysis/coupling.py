@@ -364,7 +364,6 @@ def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:
 
 def _intersection(one: list[tuple[float, float]], other: list[tuple[float, float]],
                   ) -> list[tuple[float, float]]:
-    """Return the intersection of two ordered lists of time ranges."""
     found, i, j = [], 0, 0
     while i < len(one) and j < len(other):
         low, high = max(one[i][0], other[j][0]), min(one[i][1], other[j][1])
@@ -519,7 +518,6 @@ def chance(squared: FloatArray, spare: float, level: float) -> tuple[float, floa
 
 def _sign_test(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
                rng: np.random.Generator) -> tuple[float, float]:
-    """Return the p-values of the sum and of the largest bin under random signs."""
     count = len(x)
     length = max(1, min(_BLOCK, count // _SIGNED))
     starts = np.arange(0, count, length)

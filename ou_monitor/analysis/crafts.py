@@ -240,7 +240,6 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
 
 
 def _measure(kind: str, name: str, value: float, reach: float, middle: float) -> Measure:
-    """Judge a value by its interval, value +- reach."""
     usual = middle / _USUAL, middle * _USUAL
     high = value - reach > usual[1]
     if high or value + reach < usual[0]:

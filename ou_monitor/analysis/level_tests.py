@@ -107,7 +107,6 @@ class Shape:
     coupling_p: float = NAN
 
     def __getitem__(self, name: str) -> TestResult:
-        """Return a test by name."""
         return next(test for test in self.tests if test.name == name)
 
 

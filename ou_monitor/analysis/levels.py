@@ -107,7 +107,6 @@ def half_width(t: FloatArray, throttle: FloatArray) -> float:
 
 
 def _time_at(t: FloatArray, level: LoadLevel) -> float:
-    """Return the time at a level, s; settling left out."""
     return sum(float(t[s.stop - 1] - t[s.start]) for s in level.segments)
 
 
@@ -253,14 +252,12 @@ def _half_widths(centres: Sequence[float], width: float) -> FloatArray:
 
 
 def _split_at_pauses(run: LevelSegment, broken: BoolArray) -> list[LevelSegment]:
-    """Return the pieces of a segment between pauses."""
     cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
     ends = [run.start, *cuts.tolist(), run.stop]
     return [LevelSegment(a, b) for a, b in zip(ends, ends[1:])]
 
 
 def _passage(t: FloatArray, throttle: FloatArray, run: LevelSegment, width: float) -> bool:
-    """Return whether throttle only passes through the level."""
     if t[run.stop - 1] - t[run.start] >= _PASSAGE:
         return False
     inside = throttle[run.start:run.stop]

@@ -432,20 +432,18 @@ def fed(recording: Recording, window: float, push: Callable[[slice], None],
 
 def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonitor | None,
                 ) -> tuple[SupplyLoad, Budget | None, MonitorReport | None]:
+    if limit is None:
+        load = LoadFilter()
+        for begin in range(0, recording.n, _SLICE):
+            part = slice(begin, begin + _SLICE)
+            load.push(recording.t[part], recording.voltage[part], recording.throttle[part],
+                      None if recording.current is None else recording.current[part])
+        return load.load(), None, None
     if monitor is None:
-        if limit is None:
-            load = LoadFilter()
-            for begin in range(0, recording.n, _SLICE):
-                part = slice(begin, begin + _SLICE)
-                load.push(recording.t[part], recording.voltage[part], recording.throttle[part],
-                          None if recording.current is None else recording.current[part])
-            return load.load(), None, None
         # The budget does not depend on the fit of `window: auto`.
         monitor, parts = node_for(
             recording, MonitorSettings(window=SLIDING, brownout_voltage=limit))
         deque(parts, 0)
-    if limit is None:
-        return monitor.load_filter.load(), None, None
     last, asked = monitor.report(0.0), monitor.settings
     return last.load, Budget(
         last.budget, limit, asked.brownout_horizon, asked.budget_limit), last

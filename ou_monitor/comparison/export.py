@@ -151,7 +151,6 @@ def _px4(n: _Numbers, full_current: float) -> str:
 
 
 def _capacity(n: _Numbers, full_current: float) -> float:
-    """Return the capacity of the pack, Ah."""
     if math.isfinite(n.stated):
         return n.stated
     if not (math.isfinite(n.charge) and math.isfinite(n.drain)) or not n.charge > 0.0:
@@ -218,7 +217,6 @@ def _simulated(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatAr
 
 
 def _explained_words(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
-    """Compare the model, and its exported part, with a recording."""
     notes = []
     for words, one in (('the model', model), ('the exported part', left)):
         found = compare(recording, one, seeds=_SEEDS).as_data()

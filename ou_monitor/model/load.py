@@ -199,7 +199,6 @@ class LoadStart:
     warming_se: float = WARMING_SE
 
     def __post_init__(self) -> None:
-        """Check shapes and signs."""
         P = np.array(self.covariance, dtype=np.float64)
         if len(self.coefficients) != SIZE or P.shape != (SIZE, SIZE):
             raise ValueError(f'the load needs {SIZE} coefficients and {SIZE} rows of {SIZE} '

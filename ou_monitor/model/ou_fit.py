@@ -357,7 +357,6 @@ class _Likelihood:
 
 
 def _points(*axes: FloatArray) -> FloatArray:
-    """Return the points of a grid, shape (k, 3)."""
     return np.stack([x.ravel() for x in np.meshgrid(*axes, indexing='ij')], axis=1)
 
 
@@ -500,7 +499,6 @@ def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray |
 
 
 def _tones(part: Regression) -> FloatArray:
-    """Return the tones in the residual, V; shape (n,)."""
     edges, lowest = np.cumsum(part.lengths)[:-1], 0.5 * _PERIODS / part.slowest
     white = _innovations(part.voltage / part.size)
     return np.concatenate([

@@ -272,7 +272,6 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
 def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle: FloatArray,
              where: np.ndarray, group: np.ndarray, p: FloatArray, df: float, total: float, k: float
              ) -> Line:
-    """Measure the line to which a group of ordinates belongs."""
     low, high = max(0, group[0] - LOBE), min(where.size, group[-1] + LOBE + 1)
     if group.size <= 2 * LOBE + 1:
         peak = int(group[np.argmax(white[group])])

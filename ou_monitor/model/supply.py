@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import math
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +63,6 @@ class SupplyModel:
     full_current: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the composition."""
         names = [term.NAME for term in self.terms]
         if not names or names[0] != 'ou':
             raise ValueError("the first term of a model must be 'ou', got "
@@ -75,10 +75,7 @@ class SupplyModel:
     @property
     def ou(self) -> OU:
         """Return the first term."""
-        first = self.terms[0]
-        if not isinstance(first, OU):
-            raise ValueError("the first term of a model must be 'ou'")
-        return first
+        return cast('OU', self.terms[0])
 
     @property
     def left_out(self) -> tuple[str, ...]:

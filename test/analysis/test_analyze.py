@@ -1,16 +1,25 @@
-"""`analyze` on recordings with known truth: its numbers and words."""
+"""`analyze` on recordings with known truth: numbers, process types, risk, spectrum, JSON."""
 
+from dataclasses import replace
 import math
+import re
 
 import numpy as np
-from ou_monitor.analysis.analyze import analyze, slide
-from ou_monitor.analysis.level_result import ProcessType
+from ou_monitor.analysis.analyze import analyze, as_data, slide
+from ou_monitor.analysis.level_result import (
+    classify, detectable_kurtosis, level_spectrum, ou_spectrum, ProcessType)
+from ou_monitor.analysis.level_tests import EFFECT, examine_level, Shape, TestResult
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.records import Recording, Status
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import Estimate, plain_data, Recording, Status
+from ou_monitor.report.analysis_document import answer
+from project import ROOT
 import pytest
+from scipy import stats
 from scipy.signal import lfilter
 from simulated_recordings import ALPHA, recording, without_throttle
 
@@ -277,3 +286,207 @@ def test_tiny_recordings_end_in_a_status(n):
     for candidate in (simulated, without_throttle(simulated)):
         for level in analyze(candidate).levels:
             assert not level.estimate.usable
+
+
+def swept(seed, seconds=60.0, rate=500.0):
+    """Return a flight whose throttle never stands still: 0.2 to 0.7 in 6 s and back."""
+    t = np.arange(int(seconds * rate)) / rate
+    throttle = 0.45 + 0.25 * np.sin(2.0 * math.pi * t / 12.0)
+    voltage = simulate(t, ALPHA, 0.1 + throttle, np.random.default_rng(seed),
+                       u0=5.0 - 0.4 * throttle)
+    return Recording(t, voltage, throttle, 'swept')
+
+
+def test_throttle_that_only_passes_is_known():
+    """Sag within 4 standard errors, noise within 15 %, where flown; the risk up to there."""
+    analysis = analyze(swept(1), brownout_voltage=4.5)
+    found, facts = analysis.by_throttle, analysis.overview.facts
+    at, inside = found.throttle, found.known
+    assert at[inside] == pytest.approx([0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+    error = np.array(facts.sag.se_v)
+    assert (np.abs(np.array(facts.sag.sag_v) - 0.4 * at) < 4.0 * error)[inside].all()
+    truth = (0.1 + at[inside]) / math.sqrt(2.0 * ALPHA)
+    assert np.array(facts.noise.rms_v)[inside] == pytest.approx(truth, rel=0.15)
+    assert np.isfinite(found.risk[at <= 0.7]).all() and np.isnan(found.risk[at > 0.81]).all()
+
+
+def test_without_a_fit_the_budget_says_why():
+    """A recording too short for any window, and one that never changes."""
+    short = analyze(recording(2, ((0.1, 0.3),), seconds=0.02)).by_throttle
+    assert math.isnan(short.budget) and short.budget_reason
+    t = np.arange(3000) / 500.0
+    stuck = analyze(Recording(t, np.full(t.size, 5.0), np.full(t.size, 0.1))).by_throttle
+    assert math.isnan(stuck.budget) and 'sensor is stuck' in stuck.budget_reason
+
+
+def test_without_throttle_the_budget_is_unknown():
+    """Even where the recording ends below the limit."""
+    low = swept(4, seconds=20.0)
+    low = Recording(low.t, low.voltage, np.full(low.n, math.nan), current=20.0 * low.throttle)
+    found = analyze(low, brownout_voltage=float(low.voltage[-1]) + 0.1)
+    assert math.isnan(found.by_throttle.budget)
+    assert math.isnan(found.overview.facts.budget.throttle)
+    assert 'no throttle keeps' not in ' '.join(answer(found)).lower()
+
+
+def test_the_voltage_is_the_nodes_unless_asked_for():
+    """4.5 V by default; NaN switches the risk off."""
+    simulated = recording(3, ((0.1, 0.3), (0.4, 0.5)), seconds=4.0)
+    default = analyze(simulated)
+    assert default.by_throttle.voltage == MonitorSettings().brownout_voltage
+    assert default.brownout_default
+    assert not analyze(simulated, brownout_voltage=4.5).brownout_default
+    none = analyze(simulated, brownout_voltage=math.nan)
+    assert np.isnan(none.by_throttle.risk).all() and math.isnan(none.by_throttle.budget)
+
+
+def test_the_curve_holds_the_whole_variance():
+    """Its integral to the Nyquist frequency is Var_inf plus the noise, aliases folded in."""
+    frequency = (np.arange(200000) + 0.5) * 500.0 / 200000
+    density = ou_spectrum(frequency, ALPHA, 0.3, 1000.0, noise_std=0.02)
+    total = density.sum() * 500.0 / 200000
+    assert total == pytest.approx(0.3 ** 2 / (2 * ALPHA) + 0.02 ** 2, rel=1e-6)
+
+
+def test_measured_and_true_spectrum_agree():
+    # About 40 points a decade over two decades; each averages >= 8 pieces (relative error below
+    # 1/sqrt(8) = 35 %), and most points average several bins; the mean of 60 or more is known to
+    # 35 % / sqrt(60) = 5 %. A two-sided or badly scaled density is off by 2.
+    simulated = recording(1, ((0.1, 0.3),), seconds=60.0)
+    (level,) = analyze(simulated).levels
+    found = level_spectrum(simulated, level.segments, level.estimate)
+    frequency, density = found.frequency, found.density
+    assert frequency.size >= 60 and frequency[0] > 0.0 and frequency[-1] < 500.0
+    ratio = density / ou_spectrum(frequency, ALPHA, 0.3, 1000.0)
+    assert ratio.mean() == pytest.approx(1.0, abs=0.2)
+    # The fit itself is within its 10 % of sigma and of alpha.
+    assert (density / found.fitted).mean() == pytest.approx(1.0, abs=0.2)
+
+
+def test_short_segments_give_nothing():
+    """Fewer than 32 samples: empty arrays."""
+    simulated = recording(2, ((0.1, 0.3),), seconds=0.02)
+    (level,) = analyze(simulated).levels
+    assert level_spectrum(simulated, level.segments, level.estimate).frequency.size == 0
+
+
+def test_unknown_noise_counts_as_none():
+    frequency = np.array([1.0])
+    assert ou_spectrum(frequency, 63.0, 0.3, 1e3, np.nan) == ou_spectrum(
+        frequency, 63.0, 0.3, 1e3)
+
+
+USABLE = Estimate(alpha=63.0, sigma=0.3, var_inf=7e-4, u0=5.0, alpha_se=0.1, sigma_se=0.1,
+                  var_inf_se=0.1, noise_std=0.0, status=Status.OK, n=10000, duration=10.0,
+                  rate=1000.0)
+WHITE = Estimate(status=Status.NO_RELAXATION, rate=1000.0)
+
+
+def shape(*rejecting, n=10000, undone=()):
+    """Return tests of which those named reject, or could not be done."""
+    tests = []
+    for name in EFFECT:
+        p = 1e-9 if name in rejecting else 0.5
+        tests.append(TestResult(name, why_not='Steps of the ADC hide it.') if name in undone
+                     else TestResult(name, p, 2.0, min(1.0, 10.0 * p)))
+    return Shape(tuple(tests), n, 0.1, 2.0, 7, (0.7, 0.3, 1.4))
+
+
+@pytest.mark.parametrize('estimate, tests, kind', [
+    (USABLE, shape('correlated'), ProcessType.DIFFUSION),
+    (USABLE, shape('correlated', 'impulses', 'gaussian'), ProcessType.IMPULSES),
+    (USABLE, shape('correlated', 'gaussian'), ProcessType.NOT_GAUSSIAN),
+    (USABLE, shape('correlated', 'one_relaxation'), ProcessType.STATIONARY),
+    (USABLE, shape('correlated', 'mean_drift', 'impulses'), ProcessType.QUASI_STATIONARY),
+    (USABLE, shape('correlated', 'variance_drift'), ProcessType.QUASI_STATIONARY),
+    (USABLE, shape('correlated', undone=('impulses', 'gaussian')), ProcessType.UNDETERMINED),
+    (USABLE, shape('correlated', n=300), ProcessType.UNDETERMINED),
+    (USABLE, shape(), ProcessType.GAUSSIAN),
+    (replace(USABLE, alpha=2000.0), shape('correlated'), ProcessType.GAUSSIAN),
+    (replace(USABLE, noise_std=0.03), shape('correlated'), ProcessType.GAUSSIAN),
+    (replace(USABLE, noise_std=0.02), shape('correlated'), ProcessType.DIFFUSION),
+    (WHITE, shape(), ProcessType.GAUSSIAN),
+    (WHITE, shape('correlated'), ProcessType.STATIONARY),
+    (WHITE, examine_level([], WHITE), ProcessType.UNDETERMINED),
+    (Estimate(status=Status.CONSTANT), shape(), ProcessType.CONSTANT),
+    (Estimate(status=Status.TOO_SHORT), shape('correlated'), ProcessType.UNDETERMINED),
+])
+def test_each_kind_has_its_reason(estimate, tests, kind):
+    """The first rule that applies decides, and says why."""
+    found = classify(estimate, tests)
+    assert found.kind is kind
+    assert found.sentence.endswith('.') and not found.sentence.endswith('..')
+
+
+def test_a_changing_level_keeps_its_process_type():
+    assert classify(USABLE, shape('correlated', 'mean_drift')).within is ProcessType.DIFFUSION
+    assert classify(USABLE, shape('mean_drift', 'impulses')).within is ProcessType.IMPULSES
+
+
+def test_lines_that_carry_most_of_the_variance_are_no_relaxation():
+    assert classify(USABLE, shape('correlated'), 0.6).kind is ProcessType.STATIONARY
+    assert classify(USABLE, shape('correlated'), 0.4).kind is ProcessType.DIFFUSION
+
+
+def test_a_rejection_without_consequence_does_not_count():
+    """An effect of 0.01 with p = 1e-9 is none."""
+    small = replace(shape('correlated'), tests=tuple(
+        replace(test, p_adjusted=1e-9, effect=0.01) if test.name == 'variance_drift' else test
+        for test in shape('correlated').tests))
+    assert classify(USABLE, small).kind is ProcessType.DIFFUSION
+
+
+def test_visible_kurtosis_is_what_the_test_sees():
+    assert detectable_kurtosis(0) == math.inf
+    n = next(n for n in range(50, 2000) if detectable_kurtosis(n) < 1.0)
+    assert n == pytest.approx(24.0 * (stats.norm.isf(0.005) + stats.norm.isf(0.1)) ** 2, abs=2)
+
+
+@pytest.fixture(scope='module')
+def analysis():
+    return analyze(recording(6, ((0.1, 0.3156), (0.4, 0.632))))
+
+
+def test_data_has_the_values_of_the_levels(analysis):
+    """The tau interval is that of alpha, turned over."""
+    data = as_data(analysis)
+    assert (data['n'], data['duration_s']) == (20000, pytest.approx(19.999))
+    assert data['rate_hz'] == pytest.approx(1000.0)
+    for level, found in zip(data['levels'], analysis.levels):
+        assert level['alpha'] == found.estimate.alpha
+        assert level['tau'] == pytest.approx(1.0 / level['alpha'])
+        assert level['tau_ci95'][0] == pytest.approx(1.0 / level['alpha_ci95'][1])
+        assert level['alpha_ci95'][1] / level['alpha'] == pytest.approx(
+            math.exp(1.96 * level['alpha_se']), rel=1e-4)
+        assert level['var_inf'] == pytest.approx(level['sigma'] ** 2 / (2 * level['alpha']))
+        assert len({len(level['psd'][name]) for name in level['psd']}) == 1
+    lengths = {len(data['sliding'][name]) for name in ('t', 'alpha', 'sigma', 'status')}
+    assert len(lengths) == 1 and lengths.pop() > 10
+
+
+def test_times_count_from_the_first_sample(analysis):
+    """As in `supply`, of a log whose stamps are dates."""
+    dated = replace(analysis.recording, t=analysis.recording.t + 1.7e9)
+    found, wanted = (as_data(analyze(one)) for one in (dated, analysis.recording))
+    assert 19.0 < found['brownout']['t'] < 20.0
+    assert found['brownout']['t'] == pytest.approx(wanted['brownout']['t'], abs=1e-3)
+    assert found['sliding']['t'] == pytest.approx(wanted['sliding']['t'], abs=1e-3)
+
+
+def names(value):
+    """Yield every key of nested data."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            yield from names(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from names(item)
+
+
+def test_every_key_is_documented(analysis):
+    text = (ROOT / 'doc' / 'analysis.md').read_text(encoding='utf-8')
+    documented = set(re.findall(r'`([a-z0-9_]+)`', text))
+    data = plain_data(as_data(analyze(read_recording(ROOT / 'bags' / 'transient'))))
+    data['source'] = {}
+    assert sorted(set(names(data)) - documented) == []

@@ -1,13 +1,17 @@
-"""A recording compared with its simulations: verdicts, and the largest difference."""
+"""A recording compared with simulations: verdicts, measures, the noise that is drawn."""
 
 from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.comparison.compare import compare, Likeness
-from ou_monitor.comparison.flight_model import _sag_error, damping, fit_flight, Readings
+from ou_monitor.analysis.supply import supply_facts
+from ou_monitor.comparison.compare import (
+    band, between_codes, compare, Difference, differences, judge, Likeness, Yardstick)
+from ou_monitor.comparison.flight_model import (
+    _sag_error, damping, fit_flight, fit_noise, FlightNoise, Readings)
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
+from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
@@ -16,6 +20,7 @@ from ou_monitor.records import Recording
 from ou_monitor.report.comparison_document import _answer, _path
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import norm
 
 ALPHA, SIGMA, LEVEL, SAG = 20.0, 0.3, 15.0, 1.5
 
@@ -360,3 +365,211 @@ def test_numbers_outside_their_bands_are_named_beside_the_verdict():
     assert 'within chance' not in many.worst + str(_path(many))
     assert 'only in part' in _answer(many)[0] and 'distribution (KS distance)' in {
         row['measure'] for row in found.measures()}
+
+
+RATE, N = 100.0, 20_000
+
+
+def white(seed: int) -> Readings:
+    """Return white noise of 0.1 V about 5 V."""
+    t = np.arange(N) / RATE
+    return Readings(t, 5.0 + 0.1 * np.random.default_rng(seed).standard_normal(N), None)
+
+
+def test_falls_of_white_noise_are_counted_as_theory_says():
+    """Of independent samples p below and q above by the noise: p q / (p + q) falls a sample."""
+    noise = white(1)
+    found = Yardstick(noise, 0.0).measure(noise.voltage)
+    for share, dips in zip((0.01, 0.05), found.dips):
+        above = norm.sf(norm.ppf(share) + 1.0)
+        expected = share * above / (share + above) * RATE * 60.0
+        # The count is nearly Poisson; the level is the sample's own quantile, which helps.
+        assert dips == pytest.approx(expected, abs=4.0 * np.sqrt(expected * 60.0 * RATE / N))
+
+
+def test_the_level_is_off_by_the_bias_of_the_path():
+    """Not by the median of few simulations, which the page would show as a second number."""
+    noise = white(3)
+    yardstick = Yardstick(noise, 0.0)
+    own, other = (yardstick.measure(noise.voltage + x) for x in (0.0, 0.03))
+    level = differences(yardstick, own, [other] * 20, 1.0, [-0.019] * 3)[1]
+    assert level.kind == 'level' and ' 19 mV too low' in level.words(level.band)
+
+
+def test_a_fall_is_a_dip_of_the_facts():
+    """Both count the same runs: of noise about the level a crossing is none."""
+    samples = white(4).part(slice(0, 4000))
+    u = (samples.t % 4.0 > 2.0).astype(float)
+    v = samples.voltage - 0.3 * u
+    own = Recording(samples.t, v, u)
+    levels = (4.75, 5.0)
+    yardstick = Yardstick(Readings(own.t, v, u), 0.0, levels)
+    counts = yardstick.measure(v).dips[:2] * yardstick.minutes
+    assert counts.tolist() == pytest.approx([supply_facts(own, x).dips.count for x in levels])
+    crossings = [np.count_nonzero((v[:-1] >= x) & (v[1:] < x)) for x in levels]
+    assert np.all(counts < 0.8 * np.array(crossings)) and np.all(counts > 0)
+
+
+def test_white_noise_has_equal_power_in_equal_bands():
+    """A flat spectrum: each band has its share of the variance."""
+    noise = white(2)
+    yardstick = Yardstick(noise, 0.0)
+    power = yardstick.measure(noise.voltage).power
+    widths = np.diff(yardstick.bands)
+    assert power[2:] == pytest.approx(0.01 * widths[2:] / (0.5 * RATE), rel=0.15)
+
+
+def test_levels_lie_between_codes():
+    assert between_codes(14.15, 0.01) == pytest.approx(14.155)
+    assert between_codes(14.153, 0.0) == 14.153
+    assert between_codes(14.154, 0.01, 14.004) == pytest.approx(14.159)
+    coarse = white(3)
+    coarse = Readings(coarse.t, 0.1 * np.rint(coarse.voltage / 0.1), None)
+    levels = Yardstick(coarse, 0.1).levels
+    assert np.allclose(np.mod(np.array(levels) / 0.1, 1.0), 0.5)
+
+
+def test_the_mean_response_to_rises_is_measured():
+    """A step response of -1 V for each unit of throttle, which decays to half of it."""
+    t = np.arange(6000) / RATE
+    u = np.where((t % 4.0) < 2.0, 0.2, 0.6)
+    since = np.where(u > 0.4, t % 4.0 - 2.0, np.inf)
+    v = 15.0 - 0.4 * (u > 0.4) * (0.5 + 0.5 * np.exp(-since / 0.3))
+    yardstick = Yardstick(Readings(t, v, u), 0.0)
+    response = yardstick.measure(v).response
+    assert yardstick.rises.size == 15
+    assert response.min() == pytest.approx(-0.4, abs=0.02)
+    late = np.searchsorted(yardstick.after, 1.0)
+    assert response[late] == pytest.approx(-0.2 - 0.2 * np.exp(-1.0 / 0.3), abs=0.005)
+    assert not Yardstick(Readings(t, v, None), 0.0).measure(v).response.size
+
+
+def test_the_worst_is_the_farthest_in_half_bands():
+    seeds = np.random.default_rng(4).standard_normal(400)
+
+    def of(kind: str, measured: float, least: float = 1e-9) -> Difference:
+        return Difference(kind, measured, seeds, least, lambda b: kind)
+
+    level = of('level', 0.0)
+    p, _, worst, kind = judge([of('lowest', 4.0), of('spectrum', 6.0), level], 0.9, True)
+    # 6 at half the weight is less than 4.
+    assert worst == kind == 'lowest'
+    assert p == pytest.approx(1.0 / 401.0)
+    p, *_ = judge([of('lowest', 0.0), level], 0.9, True)
+    assert p > 0.9
+    # A band that is wide by what a pilot would not notice.
+    wide = of('lowest', 4.0, least=100.0)
+    assert judge([wide, of('level', 0.0, least=100.0)], 0.9, True)[0] == pytest.approx(1.0 / 401.0)
+    assert wide.scores()[0] == pytest.approx(0.04, rel=0.1)
+    found = band(2.5, seeds)
+    assert (found.low, found.high) == pytest.approx((-1.96, 1.96), abs=0.35)
+    assert not found.inside
+
+
+def test_the_verdict_follows_from_path_and_level():
+    """Nothing looks alike whose path is worse than a constant, or whose mean is off its band."""
+    seeds = np.random.default_rng(5).standard_normal(400)
+
+    def of(kind: str, measured: float) -> Difference:
+        return Difference(kind, measured, seeds, 1e-9, lambda b: kind)
+
+    # Twelve others at once: at 1.1 half-bands from the median the level alone is no oddity.
+    others = [Difference('lowest', 0.0, np.random.default_rng(k).standard_normal(400), 1e-9,
+                         lambda b: 'lowest') for k in range(12)]
+    looks, differs = Likeness.LOOKS_LIKE_IT, Likeness.DIFFERS
+    at = [(0.0, 0.1, True, looks), (0.0, -0.1, False, looks), (0.0, -0.1, True, differs),
+          (2.2, 0.1, True, differs)]
+    for level, explained, moved, verdict in at:
+        p, said, words, kind = judge([*others, of('level', level)], explained, moved)
+        assert p > 0.05 and said is verdict
+    assert words == kind == 'level'
+
+
+def test_a_recording_is_the_farthest_as_often_as_each_simulation():
+    """Four numbers of a recording and of 20 simulations, all of one law: p is uniform."""
+    # Of 600, 28.6 are expected to be the farthest (standard deviation 5.2), and 30 to lie outside
+    # a band of 50 simulations.
+    rng, farthest, outside = np.random.default_rng(3), 0, 0
+    for _ in range(600):
+        x = rng.standard_normal((4, 21))
+        p, *_ = judge([Difference(kind, row[0], row[1:], 1e-12, lambda b: '') for kind, row in zip(
+            ('lowest', 'level', 'spectrum', 'ks'), x)], 1.0, True)
+        farthest += p < 1.5 / 21.0
+        y = rng.standard_normal(51)
+        outside += not band(y[0], y[1:]).inside
+    assert abs(farthest - 28.6) < 4.0 * 5.2
+    assert abs(outside - 30.0) < 4.0 * 5.3
+
+
+DT, COUNT = 0.01, 12_000
+T = DT * np.arange(COUNT)
+
+
+def series(seed: int, std: float, white: float) -> np.ndarray:
+    """Return an OU of 0.2 s and white noise, V."""
+    rng = np.random.default_rng(seed)
+    return simulate(T, 5.0, std * np.sqrt(10.0), rng) + white * rng.standard_normal(COUNT)
+
+
+def fitted(x: np.ndarray, load: np.ndarray | None = None, slow: float = 0.0) -> FlightNoise:
+    """Fit the noise of a supply of 4 cells."""
+    return fit_noise(Readings(T, 15.0 + x, load), x, load, slow)
+
+
+def correlation(x: np.ndarray, lag: int) -> float:
+    return float(x[lag:] @ x[:-lag]) / float(x @ x)
+
+
+def test_an_ou_in_white_noise_is_drawn_again():
+    found = fitted(series(1, 0.05, 0.05))
+    drawn = np.concatenate([found.draw(COUNT, None, np.random.default_rng(k)) for k in range(8)])
+    # 120 s hold 300 relaxation times: the OU's variance is known to 8 %, its rate to some 12 %.
+    assert drawn.var() == pytest.approx(2.0 * 0.05 ** 2, rel=0.15)
+    for lag in (1, 10):
+        assert correlation(drawn, lag) == pytest.approx(0.5 * np.exp(-5.0 * DT * lag), abs=0.08)
+
+
+def test_errors_of_prediction_are_white():
+    """They have no memory, and less variance than the series, a slow process or not."""
+    for slow in (0.0, 0.02):
+        x = series(2, 0.05, 0.05)
+        x = x + (simulate(T, 0.05, slow * np.sqrt(0.1), np.random.default_rng(3)) if slow else 0.0)
+        found = fitted(x, slow=slow ** 2)
+        # In the order of their stamps again: without a load all sizes are alike.
+        assert abs(correlation(found.errors, 1)) < 4.0 / np.sqrt(COUNT)
+        assert np.mean(found.errors ** 2) < 0.8 * x.var()
+
+
+def test_white_noise_stays_white():
+    """No OU is visible in it: VISIBLE is beyond what white noise shows."""
+    found = fitted(series(4, 0.0, 0.05))
+    assert found.phi == found.theta == 0.0
+    # The mean of independent errors.
+    assert found.mean_error(DT * COUNT) == pytest.approx(0.05 / np.sqrt(COUNT), rel=0.05)
+
+
+def test_the_size_follows_load_and_changes():
+    rng = np.random.default_rng(5)
+    u = rng.random(COUNT // 10)[np.arange(COUNT) // 10]
+    changed = np.abs(np.diff(u, prepend=u[0])) > 0.2
+    size = 0.02 * np.exp(1.5 * u) * np.where(changed, 4.0, 1.0)
+    found = fitted(size * rng.standard_normal(COUNT), u)
+    assert found.sizes.follows
+    drawn = np.stack([found.draw(COUNT, u, np.random.default_rng(k)) for k in range(8)])
+    # 780 changes have an rms known to 2.5 %; the law is smooth in the change, the size is not.
+    for there, error in ((~changed & (u < 0.2), 0.1), (~changed & (u > 0.8), 0.1), (changed, 0.2)):
+        expected = np.sqrt(np.mean(size[there] ** 2))
+        assert np.std(drawn[:, there]) == pytest.approx(expected, rel=error)
+    assert not fitted(size * rng.standard_normal(COUNT), np.full(COUNT, 0.4)).sizes.follows
+
+
+def test_rounding_is_not_drawn():
+    rng = np.random.default_rng(6)
+    x = 0.1 * np.rint(10.0 * 0.1 * rng.standard_normal(COUNT))
+    found = fit_noise(Readings(T, 15.0 + x, None), x, None, 0.0)
+    assert found.draw(COUNT, None, rng).var() == pytest.approx(x.var() - 0.1 ** 2 / 12.0, rel=0.08)
+
+
+def test_a_voltage_without_noise_has_none():
+    found = fitted(np.zeros(COUNT), np.linspace(0.0, 1.0, COUNT))
+    assert np.all(found.draw(COUNT, np.linspace(0.0, 1.0, COUNT), np.random.default_rng(7)) == 0.0)

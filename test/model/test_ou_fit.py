@@ -92,58 +92,50 @@ def test_the_answer_to_a_switched_load_leaves_nothing():
     assert np.abs(regress(t, v, u, None).voltage).max() < 1e-9
 
 
-def test_buried_relaxations_lie_within_the_bounds():
-    """Of 20 rails with an OU a fifth as large as white noise, 17 lie within the bounds."""
-    # 95 % each; fewer than 17 of 20 has a chance of 1.6 %.
-    inside = 0
-    for seed in range(20):
-        t, v, u = rail(np.random.default_rng(seed), 100.0, 20.0, 0.002, 0.01, 8.0)
-        found = fit_ou(regress(t, v, u, None), 8.0)
-        assert found.status == 'not_visible'
-        inside += found.tau_below_s > 1.0 / 20.0 or found.var_inf_below > 0.002 ** 2
-    assert inside >= 17
+def buried(rng):
+    return rail(rng, 100.0, 20.0, 0.002, 0.01, 8.0), 20.0, 0.002
 
 
-def test_slow_relaxations_lie_within_the_bounds():
-    """Of 16 rails with a slow OU beside fast readings, the intervals or bounds hold 13."""
-    # 95 % each; fewer than 13 of 16 has a chance of 0.7 %.
-    inside = 0
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        alpha = rng.uniform(2.0, 5.0)
-        t, v, u = rail(rng, 600.0, alpha, 0.012, 0.016, 16.0)
-        found = fit_ou(regress(t, v, u, None), 16.0)
-        inside += (found.alpha_95[0] < alpha < found.alpha_95[1] if found.status == 'ok' else
-                   found.tau_below_s > 1.0 / alpha or found.var_inf_below > 0.012 ** 2)
-    assert inside >= 13
+def slow(rng):
+    alpha = rng.uniform(2.0, 5.0)
+    return rail(rng, 600.0, alpha, 0.012, 0.016, 16.0), alpha, 0.012
 
 
-def test_throttle_does_not_excuse_a_slow_relaxation():
-    """Of 16 rails with readings much faster than the OU, intervals of sigma hold 13."""
-    # 95 %; fewer than 13 of 16 has a chance of 0.7 %. A law of the noise's size fitted to the OU
-    # itself, whose few independent values follow throttle by chance, held 9.
-    inside = 0
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        alpha = rng.uniform(4.0, 8.0)
-        t, v, u = rail(rng, 500.0, alpha, 0.02, 0.003, 8.0, sag=0.0)
-        found = fit_ou(regress(t, v, u, None), 8.0)
-        inside += found.status != 'ok' or found.sigma_95[0] < 0.02 * np.sqrt(2.0 * alpha) < \
-            found.sigma_95[1]
-    assert inside >= 13
+def few_values(rng):
+    # A law of the noise's size fitted to the OU, whose values follow throttle by chance, held 9.
+    alpha = rng.uniform(4.0, 8.0)
+    return rail(rng, 500.0, alpha, 0.02, 0.003, 8.0, sag=0.0), alpha, 0.02
 
 
-def test_intervals_hold_if_noise_grows_with_throttle_changes():
-    """Of 16 rails whose white noise is as large again while throttle moves, intervals hold 13."""
-    # 95 %; fewer than 13 of 16 has a chance of 0.7 %.
-    inside = 0
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        t, v, u = rail(rng, 200.0, 20.0, 0.015, 0.01)
-        moves = np.abs(lfilter([0.1], [1.0, -0.9], np.gradient(u, t)))
-        found = fit_ou(regress(t, v + 0.03 * moves * rng.standard_normal(t.size), u, None), 30.0)
-        inside += found.alpha_95[0] < 20.0 < found.alpha_95[1]
-    assert inside >= 13
+def growing(rng):
+    # White noise is as large again while throttle moves.
+    t, v, u = rail(rng, 200.0, 20.0, 0.015, 0.01)
+    moves = np.abs(lfilter([0.1], [1.0, -0.9], np.gradient(u, t)))
+    return (t, v + 0.03 * moves * rng.standard_normal(t.size), u), 20.0, 0.015
+
+
+def fast_readings(rng):
+    # Of alpha D = 0.006 white noise of a thousandth of the variance would hide the OU's own.
+    t, v, _ = rail(rng, 10000.0, 63.0, 0.0047, 0.0, 2.0, sag=0.0)
+    return (t, v, None), 63.0, 0.0047
+
+
+@pytest.mark.parametrize('drawn, name, count, least', [
+    (buried, 'alpha', 20, 17), (slow, 'alpha', 16, 13), (few_values, 'sigma', 16, 13),
+    (growing, 'alpha', 16, 13), (fast_readings, 'alpha', 4, 3)])
+def test_intervals_or_bounds_hold_the_truth(drawn, name, count, least):
+    """Bounds where the OU is not visible; 95 %: fewer have a chance of 1.6 % at most."""
+    inside, visible = 0, 0
+    for seed in range(count):
+        (t, v, u), alpha, deviation = drawn(np.random.default_rng(seed))
+        found = fit_ou(regress(t, v, u, None), float(t[-1]))
+        visible += found.status == 'ok'
+        low, high = getattr(found, f'{name}_95')
+        truth = alpha if name == 'alpha' else deviation * np.sqrt(2.0 * alpha)
+        inside += (low < truth < high if found.status == 'ok' else
+                   found.tau_below_s > 1.0 / alpha or found.var_inf_below > deviation ** 2)
+    assert inside >= least
+    assert visible == {buried: 0, growing: count, fast_readings: count}.get(drawn, visible)
 
 
 def test_current_takes_its_load_out():
@@ -185,16 +177,6 @@ def test_lost_messages_cost_little_memory():
     # A twentieth of the interval's width; six other seeds: at most 0.015 of it.
     assert np.log(found.alpha / whole.alpha) == pytest.approx(
         0.0, abs=0.05 * np.log(whole.alpha_95[1] / whole.alpha_95[0]))
-
-
-def test_an_ou_without_white_noise_sampled_fast_is_found():
-    """Of alpha D = 0.006 white noise of a thousandth of the variance would hide the OU's own."""
-    inside = 0
-    for seed in range(4):
-        t, v, _ = rail(np.random.default_rng(seed), 10000.0, 63.0, 0.0047, 0.0, 2.0, sag=0.0)
-        found = fit_ou(regress(t, v, None, None), 2.0)
-        inside += found.alpha_95[0] < 63.0 < found.alpha_95[1]
-    assert inside >= 3
 
 
 def test_a_constant_signal_has_no_noise():

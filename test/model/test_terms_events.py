@@ -76,14 +76,6 @@ def test_innovations_are_student_t(dof):
     assert abs(np.mean(z[1:] * z[:-1])) < 5.0 / math.sqrt(n)
 
 
-def test_heavy_tails_leave_the_variance():
-    """At 6 degrees of freedom the kurtosis is 6: the variance to sqrt(5/n)."""
-    n = 300_000
-    x = supply(term('heavy_tails', dof=6.0), u0=0.0).simulate(
-        np.arange(n) * 0.1, np.random.default_rng(5))
-    agrees(np.mean(x * x), VAR, VAR * math.sqrt(5.0 / n), 0.03)
-
-
 UP, DOWN = 20.0, 60.0
 SHARE = UP / (UP + DOWN)
 
@@ -171,16 +163,6 @@ def test_switching_of_sigma_within_a_step(dt):
         truth = plain * (1.0 + (ratio ** 2 - 1.0) * (SHARE + (s - SHARE) * memory))
         # Neighbouring steps share states: up to twice the variance of independent ones.
         agrees(own.mean(), truth, 1.3 * own.std() / math.sqrt(own.size), 0.1)
-
-
-def test_switching_of_sigma_alone_leaves_the_level():
-    n = 200_000
-    x = supply(term('regime_switching', rate_up=UP, rate_down=DOWN, level=0.0, sigma_ratio=2.0,
-                    at_once=1.0, states=2.0),
-               u0=0.0).simulate(np.arange(n) * 0.1, np.random.default_rng(9))
-    truth = VAR * (1.0 + 3.0 * SHARE)
-    agrees(np.mean(x * x), truth, float((x * x).std()) / math.sqrt(n), 0.03)
-    assert abs(x.mean()) < 4.0 * math.sqrt(truth / n)
 
 
 @pytest.mark.parametrize('wild, words', [

@@ -1,10 +1,12 @@
-"""The law of the OU term, and of the terms that change its rate, intensity or force."""
+"""The OU, and the terms that change its mean, rate, intensity or force."""
 
 import math
 
 import numpy as np
+from ou_monitor.model.ou import simulate, stationary_variance, transition
 import pytest
 from scipy.integrate import quad
+from scipy.linalg import solve_continuous_lyapunov
 from term_examples import agrees, ALPHA, clusters, has_covariance, SIGMA, still, supply, term, U0
 
 VAR = 0.632 ** 2 / 126.0
@@ -163,3 +165,134 @@ def test_nonlinear_restoring_is_of_second_order(square, cube):
 def test_a_step_longer_than_the_cut_is_divided():
     """At steps of 4 ms (a quarter of a relaxation) the decay is as near as at 0.8 ms."""
     assert decay_error(4e-3) < 5e-5
+
+
+def test_stationary_variance_solves_the_lyapunov_equation():
+    alpha, sigma = 63.0, 0.632
+    lyapunov = solve_continuous_lyapunov(np.array([[-alpha]]), -np.array([[sigma**2]]))
+    assert stationary_variance(alpha, sigma) == pytest.approx(lyapunov[0, 0], rel=1e-12)
+
+
+def test_two_half_steps_are_one_step():
+    phi, q = transition(63.0, 0.632, [0.004, 0.002])
+    assert phi[1] ** 2 == pytest.approx(phi[0], rel=1e-14)
+    assert q[1] * (1.0 + phi[1] ** 2) == pytest.approx(q[0], rel=1e-13)
+
+
+def test_transition_at_a_tiny_step_keeps_its_digits():
+    """For alpha dt -> 0 the innovation variance is sigma^2 dt (1 - alpha dt)."""
+    _, q = transition(63.0, 0.632, 1e-12)
+    assert float(q) == pytest.approx(0.632**2 * 1e-12 * (1.0 - 63e-12), rel=1e-12)
+
+
+@pytest.mark.parametrize('regular', [True, False])
+def test_paths_have_the_exact_covariance(regular):
+    """Cov(x_j, x_k) = Var_inf exp(-alpha |t_j - t_k|), over 10 000 paths."""
+    # The standard error of a sample covariance is at most Var_inf sqrt(2 / paths); five of them, 7
+    # %, bound the largest of 36 entries.
+    rng = np.random.default_rng(11)
+    t = np.arange(8) * 0.005 if regular else np.array(
+        [0.0, 0.001, 0.004, 0.0041, 0.02, 0.03, 0.031, 0.09])
+    paths = np.array([simulate(t, 63.0, 0.632, rng) for _ in range(10_000)])
+    var_inf = 0.632**2 / 126.0
+    expected = var_inf * np.exp(-63.0 * np.abs(t[:, None] - t[None, :]))
+    error = np.abs(paths.T @ paths / len(paths) - expected)
+    assert error.max() < 5.0 * var_inf * math.sqrt(2.0 / len(paths))
+
+
+def test_start_and_level_are_respected():
+    rng = np.random.default_rng(0)
+    t = np.arange(5) * 0.01
+    path = simulate(t, 63.0, 0.0, rng, u0=5.0, start=-0.368)
+    assert path == pytest.approx(5.0 - 0.368 * np.exp(-63.0 * t), rel=1e-12)
+
+
+def test_sigma_may_change_along_the_path():
+    """Zero noise after the third stamp leaves pure decay."""
+    rng = np.random.default_rng(5)
+    t = np.arange(6) * 0.01
+    path = simulate(t, 63.0, np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), rng)
+    assert path[3:] == pytest.approx(path[2] * np.exp(-63.0 * (t[3:] - t[2])), rel=1e-12)
+
+
+@pytest.mark.parametrize('alpha, sigma, dt, word', [
+    (0.0, 1.0, 0.1, 'alpha'), (-1.0, 1.0, 0.1, 'alpha'), (math.nan, 1.0, 0.1, 'alpha'),
+    (1.0, -1.0, 0.1, 'sigma'), (1.0, 1.0, -0.1, 'steps'), (1.0, 1.0, math.nan, 'steps')])
+def test_bad_parameters_are_named(alpha, sigma, dt, word):
+    with pytest.raises(ValueError, match=word):
+        transition(alpha, sigma, dt)
+
+
+def test_no_stamps_give_an_empty_path():
+    assert simulate([], 63.0, 1.0, np.random.default_rng(0)).shape == (0,)
+
+
+DT = 1e-3
+T = np.arange(400) * DT
+
+
+def level(*terms, throttle=None, t=T):
+    """Return what the terms add to the level, V."""
+    return still(*terms).simulate(t, np.random.default_rng(0), throttle)
+
+
+def step_at(k, low=0.0, high=1.0):
+    return np.where(np.arange(T.size) < k, low, high)
+
+
+@pytest.mark.parametrize('start', [0.0, 1000.0])
+def test_sag_follows_throttle_at_once(start):
+    """-((linear + growth t) u + square u^2), at once, t from the first sample."""
+    throttle = np.random.default_rng(1).random(T.size)
+    sag = term('load_sag', linear=0.3, square=0.07, growth=-0.4)
+    np.testing.assert_allclose(
+        level(sag, throttle=throttle, t=start + T),
+        -(0.3 - 0.4 * T) * throttle - 0.07 * throttle ** 2, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(level(sag.at(0.2), throttle=throttle),
+                               -(0.3 - 0.08) * throttle - 0.07 * throttle ** 2, atol=1e-14)
+
+
+@pytest.mark.parametrize('gain, tau', [(0.4, 0.03), (-0.2, 0.005), (0.1, 2.0)])
+def test_transient_of_a_step(gain, tau):
+    """A step from 20 to 70 % shows as 0.5 gain exp(-t/tau) and nothing before."""
+    found = level(term('load_transient', gain=gain, tau=tau, delay=0.0),
+                  throttle=step_at(100, 0.2, 0.7))
+    since = T - T[100]
+    np.testing.assert_allclose(
+        found, np.where(since >= 0.0, 0.5 * gain * np.exp(-since / tau), 0.0), rtol=0, atol=1e-13)
+
+
+def test_transient_of_uneven_stamps():
+    t = np.cumsum(np.random.default_rng(3).exponential(DT, 400))
+    found = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=step_at(100),
+                  t=t)
+    since = t - t[100]
+    np.testing.assert_allclose(
+        found, np.where(since >= 0.0, 0.4 * np.exp(-since / 0.03), 0.0), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize('delay, later', [(0.02, 20), (0.001, 1), (0.1, 100), (0.0205, 21)])
+@pytest.mark.parametrize('start', [0.0, 0.3, 1000.1])
+def test_transient_comes_after_its_delay(delay, later, start):
+    t = start + np.arange(400) / 1000.0
+    throttle = step_at(100) * 0.5 + 0.1
+    prompt = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=throttle, t=t)
+    late = level(term('load_transient', gain=0.4, tau=0.03, delay=delay), throttle=throttle, t=t)
+    np.testing.assert_allclose(late[later:], prompt[:-later], rtol=0, atol=1e-9)
+    assert not late[:100 + later].any() and late[100 + later] != 0.0
+
+
+@pytest.mark.parametrize('start', [0.0, 1.7e9])
+def test_drift_counts_from_the_first_sample(start):
+    """Rate t + curvature t^2 from the first sample, whatever clock the stamps are of."""
+    found = level(term('drift', rate=-0.5, curvature=0.3), t=start + T)
+    np.testing.assert_allclose(found, -0.5 * T + 0.3 * T ** 2, rtol=0,
+                               atol=1e-12 if start == 0.0 else 1e-6)
+
+
+def test_drift_follows_the_charge_drawn():
+    """Charge times the sum of throttle over time, each value held over the step before it."""
+    throttle = np.random.default_rng(2).random(T.size)
+    drawn = np.append(0.0, np.cumsum(throttle[1:] * np.diff(T)))
+    found = level(term('drift', rate=-0.5, curvature=0.0, charge=-0.2), throttle=throttle)
+    np.testing.assert_allclose(found, -0.5 * T - 0.2 * drawn, rtol=0, atol=1e-12)

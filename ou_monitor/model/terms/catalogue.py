@@ -8,7 +8,7 @@ the group `ou_monitor.causes`.  If such a cause cannot be used, the reason is re
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -61,8 +61,12 @@ def left_out() -> tuple[str, ...]:
 
 def blamed(error: BaseException) -> tuple[str, ...]:
     """Return the causes of other packages whose code raised an error."""
-    modules = {frame.f_globals.get('__name__') for one in _chain(error)
-               for frame, _ in traceback.walk_tb(one.__traceback__)}
+    modules = set()
+    cause: BaseException | None = error
+    while cause is not None:
+        modules |= {frame.f_globals.get('__name__')
+                    for frame, _ in traceback.walk_tb(cause.__traceback__)}
+        cause = cause.__cause__
     return tuple(name for name in _installed() if catalogue()[name].__module__ in modules)
 
 
@@ -78,12 +82,6 @@ def withdraw(error: BaseException) -> bool:
 def _installed() -> list[str]:
     return [name for name, kind in catalogue().items()
             if not kind.__module__.startswith(f'{folder.__name__}.')]
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__
 
 
 def _leave_out(name: str, error: BaseException) -> None:

@@ -151,7 +151,6 @@ _NORMAL = np.polynomial.hermite_e.hermegauss(80)
 
 
 def _lopsided(draws: FloatArray, skew: float, tail: float) -> FloatArray:
-    """Transform normal draws, without standardising them."""
     return np.asarray(np.sinh((np.arcsinh(draws) + skew) / tail))
 
 
@@ -316,7 +315,6 @@ class ClockJitter(Term):
 
     @classmethod
     def _best_fit(cls, view: View, start: list[float], most: int) -> LawFit | None:
-        """Return the fit near a start."""
         step = 1.0 / view.rate
         z = view.z[view.train]
         square = z * z

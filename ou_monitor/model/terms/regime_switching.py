@@ -635,13 +635,11 @@ def _fastest(view: View) -> float:
 
 
 def _is_inside(x: FloatArray, view: View) -> bool:
-    """Return whether coordinates are within their ranges."""
     return bool(max(x[0], x[1]) <= _fastest(view) and min(x[0], x[1]) >= -12.0
                 and abs(x[3]) <= 3.0 and abs(x[4]) <= 2.0)
 
 
 def _pick(rng: np.random.Generator, weight: FloatArray) -> int:
-    """Draw a number with the given weights."""
     total = np.cumsum(weight)
     return min(int(np.searchsorted(total, rng.random() * total[-1], side='right')),
                weight.size - 1)

@@ -475,7 +475,6 @@ class Volatility(Term):
 
     @classmethod
     def _best_fit(cls, view: View, start: FloatArray, known: bool) -> LawFit | None:
-        """Return the fit near a start."""
         size, squares, sizes = _segments(view)
         span = size / view.rate
         trained = view.train.stop // size

@@ -331,7 +331,6 @@ class Term:
     SEPARATED_BY: ClassVar[str] = ''
 
     def __post_init__(self) -> None:
-        """Check every parameter against its declaration."""
         for spec in fields(self):
             value = getattr(self, spec.name)
             if 'several' in spec.metadata:
