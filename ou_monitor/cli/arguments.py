@@ -46,7 +46,7 @@ def read_given(args: argparse.Namespace, signal: str | None = None
     from ou_monitor.recordings.read import read_beside, read_recording
 
     start, end = part_of_recording(args)
-    with Progress('reading', args.json == output.STDOUT) as progress:
+    with Progress('reading') as progress:
         options = {
             'msg_config': args.msg_config, 'voltage_topic': args.voltage_topic,
             'throttle_topic': args.throttle_topic, 'partial': args.partial, 'start': start,

@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
 
     names = frozenset(name for name in (args.voltage, args.throttle, args.current, *args.signal)
                       if name is not None)
-    with Progress('reading', args.json == output.STDOUT) as progress:
+    with Progress('reading') as progress:
         log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress,
                                            columns_given(args)))
     return _list(args, log) if args.list else _convert(args, log)
@@ -41,7 +41,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
              'log_time': 'as in the file, s' if log.format == 'csv' else
              's from the start of the log',
              **{f'log_{key}': value for key, value in log.facts.items()}}
-    with Progress('writing', args.json == output.STDOUT) as progress, \
+    with Progress('writing') as progress, \
             output.replacing(args.out, args.force):
         topics, moved = write_log(chosen, extras, args.out, about, progress=progress)
     notes = (*log.notes, *chosen.notes, *said, *moved)

@@ -54,9 +54,7 @@ def run(args: argparse.Namespace) -> int:
     output.check_paths({f'recording {k}': source.path for k, source in enumerate(
         found.sources, 1)}, {'--json': args.json}, force=True)
     try:
-        quiet = args.json == output.STDOUT
-        with Progress('comparing', quiet) as comparing, \
-                Progress('analyzing', quiet) as progress:
+        with Progress('comparing') as comparing, Progress('analyzing') as progress:
             fleet = run_fleet(
                 found, folder, options, version, workers=args.workers or usable_cores(),
                 scheduler=args.scheduler, insecure=args.insecure, pattern=pattern,

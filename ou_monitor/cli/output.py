@@ -1,8 +1,4 @@
-"""
-Output of commands: text and progress on the terminal, JSON and other files.
-
-Progress is a bar with the time left on a terminal, and a line every minute elsewhere.
-"""
+"""Output of commands: text and progress on the terminal, JSON and other files."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 import json
-import math
 import os
 from pathlib import Path
 import shlex
@@ -25,20 +20,17 @@ if TYPE_CHECKING:
     from ou_monitor.report.document import Document
     from ou_monitor.report.result import Result
 
-# Seconds between two lines without a terminal, and before the remaining time is estimated.
-_EVERY, _FIRST = 60.0, 2.0
-# Share of the work after which the remaining time is estimated.
-_LEAST = 0.02
+# Seconds, and share of the work, after which the remaining time is estimated.
+_FIRST, _LEAST = 2.0, 0.02
 
 
 class Progress:
-    """Progress of a command on standard error (quiet: nothing unless that is a terminal)."""
+    """Progress bar of a command on standard error, if that is a terminal."""
 
-    def __init__(self, label: str, quiet: bool = False) -> None:
-        self._label, self._quiet = label, quiet
+    def __init__(self, label: str) -> None:
+        self._label = label
         self._live = sys.stderr.isatty()
-        # Times of the last bar and of the last line.
-        self._drawn_at, self._printed_at = 0.0, time.monotonic()
+        self._drawn_at = 0.0
         # Time and value of the first share, which may include results of an earlier run.
         self._first: tuple[float, float] | None = None
 
@@ -46,12 +38,7 @@ class Progress:
         """Show that `share`, 0..1, is done."""
         now = time.monotonic()
         self._first = self._first or (now, share)
-        if not self._live:
-            if now - self._printed_at >= _EVERY and share < 1.0 and not self._quiet:
-                self._printed_at = now
-                self._write(f'{self._label}: {share:.0%} done{self._remaining_time(share, now)}\n')
-            return
-        if now - self._drawn_at < 0.1 and share < 1.0:
+        if not self._live or (now - self._drawn_at < 0.1 and share < 1.0):
             return
         self._drawn_at = now
         left = self._remaining_time(share, now)
@@ -75,17 +62,14 @@ class Progress:
             sys.stderr.write(text)
             sys.stderr.flush()
 
-    def close(self) -> None:
-        """Erase the bar."""
-        if self._live and self._drawn_at:
-            self._write('\r\x1b[K')
-        self._live, self._drawn_at, self._printed_at = False, 0.0, math.inf
-
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        """Erase the bar."""
+        if self._drawn_at:
+            self._write('\r\x1b[K')
+        self._live, self._drawn_at = False, 0.0
 
 
 def duration(seconds: float) -> str:

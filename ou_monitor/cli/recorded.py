@@ -74,7 +74,7 @@ def discover(args: argparse.Namespace) -> int:
 def reproduce(args: argparse.Namespace) -> int:
     """Run `reproduce`: every number of the paper, recomputed, with a verdict."""
     check_outputs(args)
-    with Progress('recomputing', args.json == output.STDOUT) as progress:
+    with Progress('recomputing') as progress:
         found = bench.reproduce(seed=args.seed, progress=progress)
     output.deliver(args, found)
     return 0
@@ -97,7 +97,7 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
     """Return the recording, and the result of a function of `bench`, with progress bars."""
     recording, _ = read_given(args)
     check_size(recording)
-    with Progress(label, args.json == output.STDOUT) as progress:
+    with Progress(label) as progress:
         return recording, function(recording, progress=progress, **given)
 
 

@@ -42,8 +42,7 @@ def run(args: argparse.Namespace) -> int:
     check_outputs(args, ('--output', args.output), **{
         '--model': args.model, '--throttle': table})
     target = None if args.export is not None else args.output
-    with output.replacing(target, args.force), \
-            Progress('simulating', args.json == output.STDOUT) as progress:
+    with output.replacing(target, args.force), Progress('simulating') as progress:
         found = simulate(
             args.model, preset=args.preset, throttle=args.throttle, start=start, end=end,
             duration=args.duration, rate=args.rate, seed=args.seed,

@@ -1,4 +1,4 @@
-"""Tables, strict JSON, files and progress of the commands."""
+"""Tables, strict JSON, files and progress bar of the commands."""
 
 import argparse
 import enum
@@ -180,7 +180,7 @@ def test_files_that_appear_during_the_work_are_not_overwritten(tmp_path):
 
 
 class Screen(io.StringIO):
-    """A standard output that is a terminal."""
+    """An output that is a terminal."""
 
     def isatty(self):
         """Say so."""
@@ -220,3 +220,30 @@ def test_a_link_that_loops_is_replaced_only_with_force(tmp_path):
     with pytest.raises(InputError, match='exists already'):
         output.check_paths(inputs, {'--report': loop})
     output.check_paths(inputs, {'--report': loop}, force=True)
+
+
+@pytest.mark.parametrize('width', [20, 40, 80])
+def test_the_bar_fits_shows_the_time_left_and_is_wiped(monkeypatch, width):
+    """Results of an earlier run took no time of this one; a closed stream stops nothing."""
+    terminal, now = Screen(), [100.0]
+    monkeypatch.setattr('sys.stderr', terminal)
+    monkeypatch.setattr('time.monotonic', lambda: now[0])
+    monkeypatch.setattr('shutil.get_terminal_size', lambda *_, **__: os.terminal_size((width, 24)))
+    with pytest.raises(KeyboardInterrupt):
+        with output.Progress('work') as progress:
+            progress(0.5)
+            now[0] += 30.0
+            progress(0.75)
+            shown = terminal.getvalue().split('\r')[-1].removesuffix('\x1b[K')
+            raise KeyboardInterrupt
+    assert shown.endswith('75%, 30 s left') and len(shown) <= width
+    assert terminal.getvalue().endswith('\r\x1b[K')
+    with output.Progress('work') as progress:
+        terminal.close()
+        progress(1.0)
+
+
+def test_off_a_terminal_nothing_is_shown(capsys):
+    with output.Progress('work') as progress:
+        progress(1.0)
+    assert capsys.readouterr() == ('', '')
