@@ -5,11 +5,9 @@ A page with plots has one script, which makes them interactive from the data emb
 The content security policy allows that script by its hash, and forbids all other scripts and all
 network requests.
 
-The data of a plot are one JSON object; its columns are one block of bytes (zlib, base64).  Columns
-of up to 4096 values are exact (float64).  In longer ones, x is rounded to within 1/2000 of the
-median step, and y (float32) to 1 part in 16 million of its value or its range, whichever is
-smaller.  If a plot has more than 150 000 points, its curves are reduced to the lowest and highest
-of each group of samples, which keeps every peak; the page says so.
+The data of a plot are one JSON object; its columns are one block of float32 (zlib, base64).  If a
+plot has more than 150 000 points, its curves are reduced to the lowest and highest of each group
+of samples, which keeps every peak; the page says so.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from html import escape
 from importlib import resources
 import json
 import math
-from pathlib import Path
 import re
 from typing import Any
 import zlib
@@ -33,13 +30,9 @@ from ou_monitor.records import FloatArray, plain_data, Severity
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Curve, extremes, Plot
-from ou_monitor.stream.files import open_regular
 
-# Maximum points of a plot that is embedded in full; an hour at 1 kHz then takes 1.5 MB.
+# Maximum points of a plot that is embedded in full, which then takes up to 1.6 MB.
 MOST = 150_000
-_EXACT = 4096  # Points up to which nothing is rounded
-# Resolution of a long x column: grid steps per median step.
-_GRID = 1000
 _UNIT = re.compile(r'(10[\u207b\u00b2\u00b3\u00b9\u2070-\u2079]+ )?'
                    r'(%|1|[mk\u00b5]?(V|A|W|s|Hz|\u03a9))([\u00b2/].*)?')
 
@@ -63,9 +56,8 @@ def embed(plot: Plot, most: int = MOST) -> str:
         colour, *style = curve.style.split()
         curves.append({
             'kind': curve.kind, 'colour': int(colour[1:]), 'style': style, 'label': curve.label,
-            'every': every, 'x': _abscissa(curve.x, plot.log_x, block),
-            'y': _ordinate(curve.y, plot.log_y, block),
-            'high': None if curve.high is None else _ordinate(curve.high, plot.log_y, block)})
+            'every': every, 'x': _column(curve.x, block), 'y': _column(curve.y, block),
+            'high': None if curve.high is None else _column(curve.high, block)})
     found = {
         'title': plot.title, 'x': _axis(plot.x_label, plot.x_range, plot.log_x),
         'y': _axis(plot.y_label, plot.y_range, plot.log_y),
@@ -125,43 +117,17 @@ def _axis(label: str, ends: tuple[float, float], log: bool) -> dict[str, Any]:
             'low': ends[0], 'high': ends[1]}
 
 
-def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append x to the block; a long rising column becomes second differences on a grid."""
-    if x.size > _EXACT and not log and np.isfinite(x).all():
-        step = np.diff(x)
-        by = float(np.median(step)) / _GRID
-        if step.min() >= 0.0 and by > 0.0 and x[-1] - x[0] < by * 2 ** 31:
-            place = np.rint((x - x[0]) / by).astype(np.int64)
-            twice = np.diff(np.diff(place, prepend=0), prepend=0)
-            return _append('i4', twice.astype('<i4'), block, float(x[0]), by)
-    return _append('f8', x.astype('<f8'), block)
-
-
-def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append y to the block; a long column becomes float32, less its median if that helps."""
-    finite = y[np.isfinite(y)]
-    if y.size > _EXACT and finite.size:
-        middle, size = float(np.median(finite)), np.abs(finite[finite != 0.0])
-        offset = 0.0 if log or float(np.ptp(finite)) > abs(middle) else middle
-        if not size.size or (size.max() < 1e37 and (size.min() > 1e-37 or not log)):
-            return _append('f4', (y - offset).astype('<f4'), block, offset)
-    return _append('f8', y.astype('<f8'), block)
-
-
-def _append(kind: str, values: Any, block: bytearray, low: float = 0.0,
-            by: float = 1.0) -> list[float | str]:
-    """Append a column; return its type, place and length, and the offset and factor to decode."""
+def _column(values: FloatArray, block: bytearray) -> list[int]:
+    """Append a column to the block; return its place and length."""
     place = len(block)
-    block += values.tobytes()
-    return [kind, place, int(values.size), low, by]
+    # Numbers beyond the range of float32 become infinite, and are not drawn.
+    with np.errstate(over='ignore'):
+        block += values.astype('<f4').tobytes()
+    return [place, values.size]
 
 
 # An unknown cell on a page.
 _DASH = '\u2013'
-
-
-# How each page begins and ends.
-_BEGIN, _END = '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>', '</body></html>\n'
 
 
 @cache
@@ -216,22 +182,11 @@ def html(document: Document, command: str = '') -> str:
               "base-uri 'none'; form-action 'none'")
     style = _file('page.css') + (_file('plots.css') if text else '')
     script = f'<script>{text}</script>\n' if text else ''
-    return (f'{_BEGIN}\n'
+    return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>\n'
             f'<meta http-equiv="Content-Security-Policy" content="{policy}"/>\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1"/>\n'
             f'<title>{escape(document.title)}</title>\n<style>\n{style}</style></head>\n'
-            f'<body>\n{_top(document)}{body}\n{script}{_END}')
-
-
-def is_page(path: Path, title: str) -> bool:
-    """Return whether a file begins and ends as the page of a document with this title."""
-    try:
-        with open_regular(path) as file:
-            page = file.read()
-    except OSError:
-        return False
-    return page.startswith(_BEGIN.encode()) and page.endswith(_END.encode()) and (
-        f'<title>{escape(title)}</title>'.encode() in page[:1000])
+            f'<body>\n{_top(document)}{body}\n{script}</body></html>\n')
 
 
 def section(document: Document) -> str:
@@ -267,8 +222,7 @@ def _part(part: Part, live: bool = True) -> str:
     if isinstance(part, Table):
         return _table(part)
     if isinstance(part, Figure):
-        drawn = part.drawing if isinstance(part.drawing, str) else (
-            part.drawing.svg() + (embed(part.drawing) if live else ''))
+        drawn = part.drawing.svg() + (embed(part.drawing) if live else '')
         below = f'<figcaption>{_html(part.caption)}</figcaption>' if part.caption else ''
         return f'<figure>{drawn}{below}</figure>'
     if isinstance(part, Pair):

@@ -5,38 +5,21 @@ const LEFT = 62, RIGHT = 14, TOP = 8, BOTTOM = 42;
 const FONT = '12px system-ui, -apple-system, "Segoe UI", sans-serif';
 const DASH = [6, 4];
 
-// Decode the columns of a figure: a compressed block of bytes in base64; see page.embed.
+// Decode the columns of a figure: a compressed block of float32 in base64; see page.embed.
 async function unpack(figure) {
   const text = atob(figure.block), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));
   const buffer = await new Response(plain).arrayBuffer();
+  const column = ([place, count]) => new Float32Array(buffer, place, count);
   for (const curve of figure.curves) {
-    curve.x = column(buffer, curve.x);
-    curve.y = column(buffer, curve.y);
-    curve.high = curve.high && column(buffer, curve.high);
+    curve.x = column(curve.x);
+    curve.y = column(curve.y);
+    curve.high = curve.high && column(curve.high);
     curve.shown = true;
     curve.sorted = curve.x.every((x, i) => i === 0 || x >= curve.x[i - 1]);
   }
   figure.block = '';
-}
-
-function column(buffer, [kind, place, count, low, by]) {
-  const size = kind === 'f8' ? 8 : 4;
-  const raw = buffer.slice(place, place + size * count);
-  if (kind === 'f8') return new Float64Array(raw);
-  const out = new Float64Array(count);
-  if (kind === 'f4') {
-    new Float32Array(raw).forEach((v, i) => { out[i] = v + low; });
-  } else {
-    let step = 0, where = 0;
-    new Int32Array(raw).forEach((v, i) => {
-      step += v;
-      where += step;
-      out[i] = low + by * where;
-    });
-  }
-  return out;
 }
 
 // One axis: data to pixels and back, over the part in view.

@@ -2,10 +2,10 @@
 
 from hypothesis import given, strategies as st
 import numpy as np
-from ou_monitor.report.document import Document, Figure
+from ou_monitor.report.document import Document, Figure, Text
 from ou_monitor.report.page import embed, envelope, html
 from ou_monitor.report.svg import Curve, Plot
-from pages import parsed, self_contained, unpacked
+from pages import self_contained, unpacked
 import pytest
 
 EVIL = '</script><img src=x onerror="alert(1)"/>]]>&amp;<!--'
@@ -22,47 +22,14 @@ def embedded(plot, **more):
     return unpacked(embed(plot, **more))['curves']
 
 
-def test_short_columns_are_exact():
-    """Every bit, with gaps, infinities, repeated and unsorted x."""
+def test_columns_are_float32():
+    """With gaps, repeated and unsorted x; what no float32 holds is infinite or 0."""
     x = np.array([0.0, 0.1, 0.1, np.nan, 7.0 / 3.0, -1.0])
     y = np.array([1e-300, np.nan, np.inf, -1e300, 0.1, np.pi])
     (curve,) = embedded(Plot('t', 'x', 'y').line(x, y))
-    assert np.array_equal(curve['x'], x, equal_nan=True)
-    assert np.array_equal(curve['y'], y, equal_nan=True)
-
-
-@pytest.mark.parametrize('scale, offset', [(1.0, 0.0), (1e-3, 101325.0), (1e12, 0.0),
-                                           (1e-9, 0.0)])
-def test_long_columns_are_within_the_rounding_stated(scale, offset):
-    """Of x, 1/2000 of a sample; of y, 2^-24 of the value or the range, whichever is less."""
-    t, y = noise(20000)
-    y = offset + scale * y
-    y[777] = np.nan
-    (curve,) = embedded(Plot('t', 'time, s', 'V').line(t, y))
-    # The last digit of float64 beside the rounding of the place on the grid.
-    assert np.abs(curve['x'] - t).max() <= np.median(np.diff(t)) / 2000.0 + 1e-12
-    assert np.array_equal(np.isnan(curve['y']), np.isnan(y))
-    bound = 2.0 ** -24 * np.minimum(np.abs(y), np.nanmax(y) - np.nanmin(y))
-    assert np.nanmax(np.abs(curve['y'] - y) / (bound + 1e-15 * np.abs(y))) <= 1.0
-
-
-@pytest.mark.parametrize('x', [np.geomspace(1e-3, 1e6, 9000), np.arange(9000.0)[::-1],
-                               np.full(9000, 2.0), np.r_[np.zeros(8999), np.nan]])
-def test_long_x_that_fits_no_grid_is_exact(x):
-    """Falling, constant, unknown, or spread over decades."""
-    for log in (False, True):
-        (curve,) = embedded(Plot('t', 'x', 'y', log_x=log).line(x, np.sin(x)))
-        assert np.allclose(curve['x'], x, rtol=0.0, equal_nan=True,
-                           atol=np.median(np.abs(np.diff(x[:-1]))) / 2000.0)
-
-
-def test_values_that_no_float32_holds_are_exact():
-    """Beyond its range, and below it on a logarithmic axis."""
-    x = np.arange(5000.0)
-    for odd, log in ((1e300, False), (1e-40, True)):
-        y = np.where(x == 3.0, odd, 1.0)
-        (curve,) = embedded(Plot('t', 'x', 'y', log_y=log).line(x, y))
-        assert np.array_equal(curve['y'], y)
+    assert np.allclose(curve['x'], x, 2.0 ** -24, 0.0, equal_nan=True)
+    assert np.allclose(curve['y'], [0.0, np.nan, np.inf, -np.inf, 0.1, np.pi], 2.0 ** -24, 0.0,
+                       equal_nan=True)
 
 
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.0, np.nan]), min_size=1, max_size=30))
@@ -150,7 +117,7 @@ def test_hostile_names_stay_names():
 
 def test_a_page_without_plots_has_no_script():
     """Nothing to run, and the policy forbids all of it."""
-    self_contained(html(Document('t', 's', [], [Figure('', 'c')])))
+    self_contained(html(Document('t', 's', [], [Text('c')])))
 
 
 @pytest.mark.parametrize('label, name, unit', [
@@ -166,8 +133,5 @@ def test_axis_labels_hold_a_name_and_a_unit(label, name, unit):
 
 
 def test_static_drawings_carry_no_data():
-    """A drawing by itself, as in doc/, is the drawing alone; on a page it is still there."""
-    drawing = Plot('t', 'x', 'y').line(np.arange(3.0), np.arange(3.0)).svg()
-    assert 'script' not in drawing
-    whole = parsed(html(Document('t', 's', [], [Figure(drawing)])))
-    assert whole.find('.//figure/svg/svg/path') is not None
+    """A drawing by itself, as in doc/, is the drawing alone."""
+    assert 'script' not in Plot('t', 'x', 'y').line(np.arange(3.0), np.arange(3.0)).svg()

@@ -9,7 +9,6 @@ import zlib
 
 import numpy as np
 
-_TYPES = {'f8': '<f8', 'f4': '<f4', 'i4': '<i4'}
 # Elements that load something with any attributes.
 _LOADING = {'link', 'img', 'iframe', 'object', 'embed', 'audio', 'video', 'source', 'base',
             'image', 'use', 'a', 'form', 'input'}
@@ -57,12 +56,9 @@ def unpacked(script):
     found = json.loads(re.fullmatch(r'<script[^>]*>(.*)</script>', script, re.DOTALL).group(1))
     block = zlib.decompress(base64.b64decode(found['block']))
 
-    def column(about):
-        kind, place, count, low, by = about
-        values = np.frombuffer(block, _TYPES[kind], count, place).astype(np.float64)
-        return low + by * (values.cumsum().cumsum() if kind == 'i4' else values)
-
     for curve in found['curves']:
         for name in ('x', 'y', 'high'):
-            curve[name] = curve[name] and column(curve[name])
+            if curve[name] is not None:
+                place, count = curve[name]
+                curve[name] = np.frombuffer(block, '<f4', count, place).astype(np.float64)
     return found
