@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from html import escape
 import math
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.discovery.finding import Finding
+from ou_monitor.discovery.finding import Criticism, Finding
 from ou_monitor.discovery.words import (
     both_names, by_load, cause_rows, curve_text, GAIN, gain_text, input_words, parameters,
     plain_words, with_error)
@@ -23,15 +22,10 @@ from ou_monitor.text import number, Z95
 
 # Maximum remaining discrepancies on a terminal.
 _SHOWN = 8
-# Maximum rows of statistics drawn.
+# Maximum rows of the table of statistics.
 _ROWS = 18
-# Sizes of the drawing of statistics, pixels.
-_WIDTH, _LEFT, _RIGHT, _ROW, _TOP, _BOTTOM = 860, 250, 20, 22, 34, 40
 # Number of simulations for the band of the voltage.
 _DRAWS = 20
-# Maximum score on the straight part of the scale; larger scores are logarithmic.
-_STRAIGHT = 4.0
-_TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 
 
 def discovery_document(finding: Finding, seen: Overview | None = None) -> Document:
@@ -188,26 +182,27 @@ def _under_load(finding: Finding) -> str:
 
 def _statistics(finding: Finding) -> list[Part]:
     worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
-    rows = [(by_load(c.statistic, finding.load), c.low, c.high, c.before, c.after)
-            for c in worst[:_ROWS]]
     text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
             'one-step errors lie outside the band for the plain OU'
             + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
-    dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
-    return [Figure(
-        _dot_rows(f'{dots}. Band: range of simulations', 'standard scores', rows),
-        text + 'The band comes from simulations that are fitted in the same way: with a correct '
-        'model, one recording in a hundred has a statistic outside it.')]
+    return [_scores(finding, worst[:_ROWS]), Text(
+        f'{text}The scores are in standard deviations. The band comes from simulations that are '
+        'fitted in the same way: with a correct model, one recording in a hundred has a statistic '
+        'outside it.', legend=True)]
 
 
 def _discrepancies(finding: Finding) -> Part:
     if not finding.remaining:
         return Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the band.')
+    return _scores(finding, finding.remaining)
+
+
+def _scores(finding: Finding, found: Sequence[Criticism]) -> Table:
     rows = [[by_load(c.statistic, finding.load),
              *([number(c.before)] if finding.causes else []), number(c.after),
              f'[{number(c.low)}, {number(c.high)}]',
              by_load(plain_words(c.statistic), finding.load)]
-            for c in finding.remaining]
+            for c in found]
     return Table(['statistic', *(['plain OU'] if finding.causes else []), 'score',
                   'band', 'in words'], rows, left=[0, len(rows[0]) - 1], most=_SHOWN)
 
@@ -236,60 +231,3 @@ def _parameters(finding: Finding) -> list[Part]:
              if finding.causes else 'No cause was named: this is the plain OU above.')
     return [Text(about), Table(['term', 'parameter', 'estimate +- 95 %', 'unit',
                                 'what it is'], rows, left=[0, 1, 4])]
-
-
-def _dot_rows(title: str, x_label: str,
-              rows: Sequence[tuple[str, float, float, float, float]]) -> str:
-    """Return an SVG with a row for each statistic: name, low, high, before, after."""
-    reach = max([1.5 * _STRAIGHT, *(abs(v) for row in rows for v in row[1:] if math.isfinite(v))])
-    end = math.asinh(1.1 * reach / _STRAIGHT)
-    middle, half = 0.5 * (_LEFT + _WIDTH - _RIGHT), 0.5 * (_WIDTH - _RIGHT - _LEFT)
-
-    def at(value: float) -> float:
-        return middle + half * math.asinh(value / _STRAIGHT) / end
-
-    height = _TOP + _ROW * len(rows) + _BOTTOM
-    bottom = height - _BOTTOM
-    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" '
-             f'aria-label="{escape(title, quote=True)}">',
-             f'<text class="title" x="14" y="16">{escape(title)}</text>']
-    for size in _TICKS:
-        for value in sorted({-size, size}):
-            value += 0.0
-            if abs(value) <= 1.1 * reach:
-                x = at(value)
-                parts.append(
-                    f'<line class="grid" x1="{x:.1f}" y1="{_TOP}" x2="{x:.1f}" y2="{bottom}"/>'
-                    f'<text class="tick" text-anchor="middle" x="{x:.1f}" y="{bottom + 16}">'
-                    f'{f"{value:g}".replace("-", chr(0x2212))}</text>')
-    for k, (name, low, high, before, after) in enumerate(rows):
-        y = _TOP + _ROW * (k + 0.5)
-        # Browsers show the title of a group under the pointer.
-        parts.append(f'<g><title>{escape(_dot_title(name, low, high, before, after))}</title>'
-                     f'<text class="legend" text-anchor="end" x="{_LEFT - 10}" '
-                     f'y="{y + 4:.1f}">{escape(name)}</text>'
-                     f'<rect class="band s0" x="{at(low):.1f}" y="{y - 8:.1f}" '
-                     f'width="{at(high) - at(low):.1f}" height="16"/>')
-        drawn = [v for v in (before, after) if math.isfinite(v)]
-        if len(drawn) == 2:
-            parts.append(f'<line class="grid" x1="{at(before):.1f}" y1="{y:.1f}" '
-                         f'x2="{at(after):.1f}" y2="{y:.1f}"/>')
-        for value, fill in ((before, 'var(--paper)'), (after, 'var(--c1)')):
-            if math.isfinite(value):
-                parts.append(f'<circle cx="{at(value):.1f}" cy="{y:.1f}" r="5" '
-                             f'style="fill: {fill}; stroke: var(--c1); stroke-width: 2"/>')
-        parts.append('</g>')
-    parts.append(f'<text class="label" text-anchor="middle" x="{middle:.0f}" '
-                 f'y="{height - 6}">{escape(x_label)}</text></svg>')
-    return '\n'.join(parts)
-
-
-def _dot_title(name: str, low: float, high: float, before: float, after: float) -> str:
-    def text(value: float) -> str:
-        return f'{value:.3g}'.replace('-', '\u2212')
-
-    known = [(word, value) for word, value in (('before', before), ('after', after))
-             if math.isfinite(value)]
-    # A single dot has no before and after.
-    said = [f'{word} {text(value)}' if len(known) == 2 else text(value) for word, value in known]
-    return f'{name}: {", ".join([*said, f"simulations {text(low)} to {text(high)}"])}'

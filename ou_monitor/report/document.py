@@ -71,9 +71,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """A plot, or a finished SVG, for a page."""
+    """A plot, for a page."""
 
-    drawing: Plot | str
+    drawing: Plot
     caption: str = ''
 
 

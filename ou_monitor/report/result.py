@@ -196,8 +196,7 @@ def _cells(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def _plots(parts: Sequence[Part]) -> Iterator[Plot]:
     for part in parts:
         if isinstance(part, Figure):
-            if isinstance(part.drawing, Plot):
-                yield part.drawing
+            yield part.drawing
         elif isinstance(part, (Section, Pair)):
             yield from _plots(part.parts if isinstance(part, Section) else part.figures)
         elif callable(part):

@@ -117,13 +117,12 @@ def test_the_page_shows_verdict_causes_plots_and_command(sag):
     # Names of causes stand behind plain ones.
     said = sag.sentence
     assert 'sag (load_sag)' in said and ' '.join(said.replace('+-', '\u00b1').split()) in text
-    drawings = root.findall('.//figure/svg')
-    # The voltage over its simulations, and rows of statistics.
-    assert len(drawings) == 2
+    # The voltage over its simulations.
+    assert len(root.findall('.//figure/svg')) == 1
     coordinates = re.findall(r'="([^"]*)"', ''.join(
         re.findall(r'<(?:path|line|circle|rect)[^>]*>', html)))
     assert not any(re.search(r'nan|inf', c) for c in coordinates)
-    assert html.count('<circle') >= 2 * len(sag.discrepancies[:18])
+    assert all(text.count(one.statistic) for one in sag.discrepancies[:18])
 
 
 @needs_recordings
@@ -157,7 +156,7 @@ def test_the_page_of_a_plain_rail_keeps_the_plain_model():
     text = ' '.join(''.join(root.itertext()).split())
     assert 'No cause was named: this is the plain OU' in text and 'xtended' not in text
     assert 'simulations of the plain OU at each moment' in text
-    assert len(root.findall('.//figure/svg')) == 2
+    assert len(root.findall('.//figure/svg')) == 1
     assert 'xtended' not in terminal(discovery_document(found))
 
 
