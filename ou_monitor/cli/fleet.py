@@ -24,11 +24,8 @@ TABLE, REPORT = 'fleet.parquet', 'fleet.html'
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command."""
     from ou_monitor.fleet.workers import usable_cores
 
-    if not args.output:
-        raise InputError('--output: the path is empty')
     if args.scheduler is not None and args.workers is not None:
         raise InputError('--workers is for local processes, --scheduler for a cluster: give one')
     _check_installed(args)
@@ -36,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output '{folder}' is a file: name a folder")
     from ou_monitor.fleet.find import find_recordings
-    from ou_monitor.fleet.fleet import run_fleet
+    from ou_monitor.fleet.fleet import is_own, run_fleet
     from ou_monitor.fleet.vehicles import read_pattern
 
     made = {f'--output ({name})': folder / name for name in (REPORT, TABLE)}
@@ -45,7 +42,11 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"'{path}' is not a file: remove it, or name another folder")
     output.check_paths({}, {**made, '--json': args.json}, force=True)
     output.check_paths({}, {'--json': args.json}, args.force)
-    _check_own(folder, args.force)
+    if not (args.force or is_own(folder)):
+        for path in made.values():
+            if os.path.lexists(path):
+                raise InputError(f"'{path}' was not written by fleet: --force overwrites it, or "
+                                 'name another folder')
     output.check_writable(args.json)
 
     options = _options(args)
@@ -68,20 +69,6 @@ def run(args: argparse.Namespace) -> int:
         raise InputError('none of the recordings could be analysed; the reasons are in '
                          f"'{folder}' and in the column error of the table")
     return 0
-
-
-def _check_own(folder: Path, force: bool) -> None:
-    """Refuse to replace a table or report that no earlier run wrote, except with --force."""
-    from ou_monitor.fleet.fleet import is_own
-    from ou_monitor.fleet.table import is_table
-    from ou_monitor.report.fleet_document import TITLE
-    from ou_monitor.report.page import is_page
-
-    for path in (folder / REPORT, folder / TABLE):
-        if not force and os.path.lexists(path) and not (is_own(folder) and (
-                is_table(path) if path.name == TABLE else is_page(path, TITLE))):
-            raise InputError(f"'{path}' was not written by fleet, or was changed since: --force "
-                             'overwrites it, or name another folder')
 
 
 def _check_installed(args: argparse.Namespace) -> None:
@@ -110,22 +97,17 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     from ou_monitor.report.fleet_document import as_data, fleet_document
     from ou_monitor.report.result import Result
 
-    # Again, because the run may have taken hours.
-    _check_own(folder, args.force)
     write_table(fleet.rows, folder / TABLE)
     found = Result(fleet, lambda: fleet_document(fleet), lambda: as_data(fleet), 'rows')
     output.deliver(args, found, table=folder / TABLE, report=folder / REPORT)
 
 
 def _options(args: argparse.Namespace) -> Options:
-    """Return the options of the analysis."""
     from ou_monitor.analysis.crafts import pack_limit
     from ou_monitor.fleet.analysis import Options
 
     config, content = args.msg_config, ''
     if config is not None:
-        if not config:
-            raise InputError('--msg-config: the path is empty')
         if Path(config).is_file():
             config = str(Path(config).resolve())
             try:

@@ -103,10 +103,6 @@ class Values:
         reach = Z95 * self.error
         return self.shown(self.value - reach), self.shown(self.value + reach)
 
-    def common_curve(self, throttle: FloatArray) -> FloatArray:
-        """Return the common curve through the median of all values, in the quantity's unit."""
-        return self.shown(float(np.median(self.value)) + self.curve(throttle))
-
 
 def values_of(rows: Sequence[Row], name: str) -> Values:
     """Return one quantity of every recording."""

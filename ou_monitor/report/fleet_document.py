@@ -24,8 +24,8 @@ from ou_monitor.text import chance, counted, number, p_words, some, volts
 _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
            'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1'}
 _UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s'}
-# Maximum number of significant drifts drawn; if there are none, of the most likely ones.
-_DRAWN, _LIKELY = 8, 2
+# Maximum number of drifts drawn, the most likely ones.
+_DRAWN = 8
 # Maximum trends listed, the most likely ones.
 _MOST = 30
 # Maximum recordings in the table of lowest voltages; maximum rows or sentences on a terminal.
@@ -36,7 +36,6 @@ _RECORDINGS = 500
 _ONE_PACK = 1.6
 # Maximum ageing packs named in the answer.
 _OLD = 3
-TITLE = 'Supply noise of a fleet'
 # Heads of the tables of packs and of vehicles.
 PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\nper cell, mOhm',
               'per flight\n[95 %]', 'sag\nper cell, mV', 'per flight\n[95 %]')
@@ -50,7 +49,6 @@ LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'per cell, V', 'at, s', 'di
 
 
 def fleet_document(fleet: Fleet) -> Document:
-    """Return the report of a fleet."""
     rows = worst(fleet)
     odd, possible = finding_words(fleet), fleet.judgement.possible
     vehicles = vehicle_table(fleet)
@@ -79,12 +77,11 @@ def fleet_document(fleet: Fleet) -> Document:
                     vehicles.heads) else ''), legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
-                 Section('Sigma over throttle', _over_throttle(fleet), folded=True),
                  Section('Verdicts and causes', _causes(fleet), folded=True)],
         Section('What to know before using these numbers', [
             Notes.of([*fleet.notes, *comparison_words(fleet)])]),
         lambda: [Section('Recordings', _recordings(fleet), folded=True)]]
-    return Document(TITLE, subject, answer(fleet), parts)
+    return Document('Supply noise of a fleet', subject, answer(fleet), parts)
 
 
 def answer(fleet: Fleet) -> list[str]:
@@ -125,7 +122,6 @@ def _ageing(fleet: Fleet) -> str:
 
 
 def _flights_of_pack(fleet: Fleet, trends: Sequence[Trend]) -> str:
-    """Return flights, dates and cells of an ageing pack."""
     mine = fleet.recordings_of(trends[0].vehicle)
     dates, cells = _dates(mine), _cells_of(mine)
     words = [counted(max(t.flights for t in trends), 'flight'), '' if dates == UNKNOWN else dates,
@@ -134,7 +130,6 @@ def _flights_of_pack(fleet: Fleet, trends: Sequence[Trend]) -> str:
 
 
 def _growth(judged: Judgement, trend: Trend) -> str:
-    """Return by how much a quantity of a pack grows, and its first and last value."""
     values = judged.values[trend.quantity]
     first, last = (_without_unit(values, trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
@@ -284,7 +279,6 @@ def _cells(row: Row) -> str:
 
 
 def _dates(rows: Sequence[Row]) -> str:
-    """Return the dates of the first and the last flight of a vehicle."""
     found = [row['start'] for row in rows if row['start']]
     days = sorted({f'{date:%Y-%m-%d}' for date in (min(found), max(found))}) if found else []
     return ' to '.join(days) or UNKNOWN
@@ -377,7 +371,6 @@ def _pack_value(rows: Sequence[Row], name: str, star: str) -> str:
 
 
 def _star(judged: Judgement, name: str, vehicle: str) -> str:
-    """Return a star if a vehicle is unlike the others."""
     one = judged.vehicles[name]
     return '*' * bool(vehicle in one.names and one.outliers.found[one.names.index(vehicle)])
 
@@ -398,7 +391,6 @@ def _flights(rows: Sequence[Row]) -> str:
 
 
 def vehicle_table(fleet: Fleet) -> Table:
-    """Return the table of vehicles."""
     judged = fleet.judgement
     found = []
     shown_as = short_names(fleet.vehicles)
@@ -559,7 +551,6 @@ def _cell(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
 
 
 def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
-    """Return the plot of the lowest voltages by vehicle, with the limit."""
     names = [*fleet.vehicles, *(['unknown'] if any(row['vehicle'] is None for row in rows)
                                 else [])]
     under = np.array([bool(row['dips']) for row in rows])
@@ -608,13 +599,10 @@ def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
 
 def _drift(fleet: Fleet) -> list[Part]:
     judged = fleet.judgement
-    drawn = list(judged.drifting[:_DRAWN]) or list(judged.trends[:_LIKELY])
-    if not drawn:
+    if not judged.trends:
         return [Text('No vehicle has enough flights for a test.')]
-    parts: list[Part] = [] if judged.drifting else [
-        Text('No drift is significant; the most likely ones are drawn.')]
-    parts += Pair.two_by_two([
-        Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
+    parts = Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
+                             for t in judged.drifting[:_DRAWN]])
     rows = [[t.vehicle, t.quantity, str(t.flights), change(t.slope) + '\n'
              + f'[{change(t.low)}, {change(t.high)}]',
              chance(t.p_value), chance(t.p_family),
@@ -648,24 +636,7 @@ def _trend_plot(values: Values, trend: Trend) -> Plot:
     return plot.line(at, scale * values.shown(trend.line(at)), '', 1, 'thick')
 
 
-def _over_throttle(fleet: Fleet) -> list[Part]:
-    values = fleet.judgement.values['sigma']
-    good = [row for row in fleet.rows if row['status'] in USABLE and row['sigma'] is not None
-            and row['throttle'] is not None]
-    if len(good) < 5 or not math.isfinite(values.curve.reference):
-        return []
-    u = np.array([row['throttle'] for row in good])
-    plot = Plot(f'{_TITLES["sigma"]} over throttle, all levels', 'throttle, %', _UNITS['sigma'],
-                width=450, height=240, log_y=True)
-    plot.markers(100.0 * u, np.array([row['sigma'] for row in good]), '', 7)
-    at = np.linspace(float(u.min()), float(u.max()), 60)
-    return [Figure(plot.line(100.0 * at, values.common_curve(at), '', 1, 'thick'),
-                   'Every level of every recording, and the common curve used to compare them, '
-                   'through their median.')]
-
-
 def _causes(fleet: Fleet) -> list[Part]:
-    """Return the counts of the verdicts and causes of discover."""
     found = [row for row in fleet.analysed if row['verdict'] is not None]
     counts = Counter([f"verdict {row['verdict']}" for row in found] + [
         f'cause {cause}' for row in found for cause in dict.fromkeys(row['causes'] or ())])
