@@ -33,8 +33,7 @@ def check_outputs(args: argparse.Namespace, bag: tuple[str, Path | None] = ('', 
         if str(target) == output.STDOUT:
             raise InputError(f"{name} needs a file: '-' is not supported")
     for target in (args.json, *files.values()):
-        # An empty path passes here: `check_paths` reports it with its option.
-        output.check_writable(target or None)
+        output.check_writable(target)
     if path is not None:
         output.check_bag(option, path, args.force)
     output.check_paths(inputs, {'--json': args.json, **files, option: path}, args.force)

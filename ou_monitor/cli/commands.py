@@ -10,7 +10,7 @@ import math
 import re
 from typing import Any
 
-from ou_monitor.cli.output import path_argument
+from ou_monitor.cli.output import given, path_argument
 from ou_monitor.text import plain_number, printable
 
 
@@ -130,7 +130,7 @@ PROBABILITY = number('a probability between 0 and 1', lambda value: 0.0 < value 
 TIME = number('a time in seconds, 0 or more', lambda value: 0.0 <= value < math.inf)
 
 RECORDING = Option(
-    'recording', metavar='RECORDING',
+    'recording', metavar='RECORDING', type=given,
     help='.mcap file, rosbag2 folder, CSV of any logger, or a log that convert reads (.bbl, .bin, '
     '.ulg)')
 # Part of a recording to read.
@@ -141,7 +141,7 @@ PART = (
            help='leave out samples from this time on, s after the first message'))
 # How a bag is read.
 TOPICS = (
-    Option('--msg-config', metavar='NAME',
+    Option('--msg-config', metavar='NAME', type=given,
            help='msg_config with topic and field of the voltage'),
     Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
     Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
@@ -180,10 +180,11 @@ FILES = (
     Option('--flight', metavar='N', type=FLIGHT,
            help='flight of a log with several, from 1 (default: the largest)'), *COLUMNS)
 JSON = Option(
-    '--json', metavar='FILE',
+    '--json', metavar='FILE', type=given,
     help="write the result as JSON ('-': to standard output, and nothing else)")
 FORCE = Option('--force', action='store_true', help='overwrite existing files')
-REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
+REPORT = Option('--report', metavar='FILE.html', type=given,
+                help='write a self-contained HTML page')
 # Up to the cells of the largest packs in use, with a margin.
 _CELLS = whole('a number of cells, 1 to 28', 1, 28)
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
@@ -356,7 +357,7 @@ _DESIGN = Command(
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
     'power network, for a range of bulk capacitances; find the smallest with a risk below --risk.',
-    (Option('--from', metavar='RECORDING', dest='recording',
+    (Option('--from', metavar='RECORDING', dest='recording', type=given,
             help='take level, sag, resistance and noise from a recording; --set overrides its '
             'values (--set cells=0: the recording is of a rail, not of a pack)'),
      Option('--risk', metavar='X', type=PROBABILITY, default=0.01,
@@ -380,7 +381,7 @@ _DESIGN = Command(
             'parallel)'),
      Option('--set', metavar='NAME=VALUE', action='append', default=[],
             help='a component, such as bulk_capacitance=1000uF; may be repeated (see --list)'),
-     Option('--network', metavar='FILE.yaml',
+     Option('--network', metavar='FILE.yaml', type=given,
             help='components as a YAML mapping of name to value; --set overrides it'),
      Option('--list', action='store_true', help='list the components and their defaults'),
      *TOPICS, *FILES, REPORT, JSON, FORCE),
@@ -395,7 +396,7 @@ _DISCOVER = Command(
     'and measure the gain on samples not used for the fit.',
     (RECORDING, *PART, seed(0), *limit('also count dips below this voltage, V'), *TOPICS, *FILES,
      JSON,
-     Option('--save-model', metavar='FILE.yaml',
+     Option('--save-model', metavar='FILE.yaml', type=given,
             help='write the extended model, for simulate --model and the estimator'),
      Option('--force', action='store_true',
             help='overwrite files that exist already, and save the model even if it predicts '
@@ -409,9 +410,9 @@ _FLEET = Command(
     'Analyze many recordings on several processes: one Parquet table with a row for each '
     'recording and load level, and a report with outliers and with the drift of each vehicle over '
     'its flights. The same command, started again, resumes a stopped run.',
-    (Option('recordings', metavar='RECORDING', nargs='+',
+    (Option('recordings', metavar='RECORDING', nargs='+', type=given,
             help='bags, CSV files and logs, as for analyze, and folders to search for them'),
-     Option('--output', metavar='DIR', required=True,
+     Option('--output', metavar='DIR', required=True, type=given,
             help='folder for fleet.parquet, fleet.html and the parts of a run'),
      Option('--workers', metavar='N', help='local processes (default: one per core)',
             type=whole('a number of processes from 1 to 1024', 1, 1024)),

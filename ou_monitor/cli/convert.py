@@ -112,7 +112,6 @@ def _list(args: argparse.Namespace, log: Any) -> int:
 
 
 def _gyros(log: Any, taken: Any) -> list[dict[str, Any]]:
-    """Return the series that could become sensor_msgs/Imu."""
     return [{'name': one.name, 'what': one.words, 'n': one.n, 'scale': one.scale,
              'angular_velocity': True, 'acceleration': one.values.shape[1] > 3,
              'default': one is taken}

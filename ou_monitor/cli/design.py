@@ -27,7 +27,6 @@ def _list(args: argparse.Namespace) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command."""
     check_outputs(args, **{'--network': args.network, '--from': args.recording})
     if args.list:
         _list(args)
@@ -80,7 +79,6 @@ def component(name: str, where: str) -> str:
 
 
 def value_of(where: str, name: str, text: object) -> Any:
-    """Return the value of a component."""
     try:
         value = quantity(UNITS[name])(text)
     except argparse.ArgumentTypeError as error:

@@ -45,7 +45,6 @@ class Parser(argparse.ArgumentParser):
 
 
 def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentParser:
-    """Return the parser."""
     parser = Parser(
         prog=PROGRAM, allow_abbrev=False,
         description='Ornstein-Uhlenbeck statistics of UAV supply rails.',
@@ -59,7 +58,6 @@ def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentPars
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    """Return the parsed arguments; exit with one line if they are wrong."""
     first = argv[0] if argv else ''
     if first and not first.startswith('-') and first not in COMMANDS:
         raise InputError(f"unknown command '{first}': {nearest(first, COMMANDS)}")
@@ -87,7 +85,6 @@ def _options(parser: argparse.ArgumentParser, command: str) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command."""
     if argv is None:
         signal.signal(signal.SIGTERM, _end)
     given = list(sys.argv[1:] if argv is None else argv)

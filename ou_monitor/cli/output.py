@@ -133,46 +133,37 @@ def write_text(text: str, target: str | Path, force: bool = False) -> None:
         write_whole(path, content, over=force)
         return
     try:
-        # Without blocking, so that a FIFO without a reader fails instead of waiting for one.
-        with open(path, 'wb', opener=lambda name, flags: os.open(
-                name, os.O_WRONLY | os.O_NONBLOCK)) as file:
-            os.set_blocking(file.fileno(), True)
-            file.write(content)
+        path.write_bytes(content)
     except OSError as error:
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
 
 
-def path_argument(text: str) -> Path:
-    """Return a path given as an argument; refuse an empty one (it means the current folder)."""
+def given(text: str) -> str:
+    """Return a path as given; refuse an empty one (it means the current folder)."""
     if not text:
         raise argparse.ArgumentTypeError('the path is empty')
-    return Path(text)
+    return text
+
+
+def path_argument(text: str) -> Path:
+    """Return a path given as an argument."""
+    return Path(given(text))
 
 
 def check_paths(inputs: Mapping[str, str | Path | None],
                 outputs: Mapping[str, str | Path | None], force: bool = False) -> None:
-    """Refuse paths that are empty, and outputs that would overwrite an input or each other."""
-    # Other existing files are overwritten only with `force`.
-    for name, given in (*inputs.items(), *outputs.items()):
-        if given is not None and not str(given):
-            raise InputError(f'{name}: the path is empty')
+    """Refuse outputs that would overwrite an input, each other, or (without force) any file."""
     written = [(name, Path(target)) for name, target in outputs.items()
                if target is not None and str(target) != STDOUT and not _is_device(Path(target))]
     for k, (name, target) in enumerate(written):
-        for source, given in inputs.items():
-            if given is not None and _overwrites(target, Path(given)):
-                raise InputError(f"{name} '{target}' would overwrite {source} '{given}', which "
+        for source, path in inputs.items():
+            if path is not None and _overwrites(target, Path(path)):
+                raise InputError(f"{name} '{target}' would overwrite {source} '{path}', which "
                                  'is read: give another name')
         for other, earlier in written[:k]:
             if _is_same_file(target, earlier):
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
-            inner, outer = sorted((_real(target), _real(earlier)),
-                                  key=lambda path: -len(path.parts))
-            if outer in inner.parents and (
-                    not outer.is_dir() or (outer / 'metadata.yaml').exists()):
-                raise InputError(f"{other} and {name}: '{inner.name}' would lie in the bag "
-                                 f"'{outer.name}': give it a name elsewhere")
     for name, target in written:
         # `check_writable` reports a folder in place of a file.
         if os.path.lexists(target) and not target.is_dir() and not force:
@@ -236,7 +227,6 @@ def _real(path: Path) -> Path:
 
 
 def _is_same_file(first: Path, second: Path) -> bool:
-    """Return whether two paths are one file, also through links."""
     if _real(first) == _real(second):
         return True
     return first.exists() and second.exists() and first.samefile(second)

@@ -19,7 +19,6 @@ _EXPORT_MOST = 200_000
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate."""
     if args.list:
         check_outputs(args)
         output.tell(args, Document('Presets', '', (), [

@@ -1,6 +1,5 @@
 """Tables, strict JSON, files and progress bar of the commands."""
 
-import argparse
 import enum
 import errno
 import io
@@ -47,7 +46,7 @@ def test_table_is_aligned():
     assert text.splitlines() == ['   n  word', '----  --------', '   1  a', '1000  long one']
 
 
-def test_paths_that_collide_or_are_empty_are_named(tmp_path):
+def test_paths_that_collide_are_named(tmp_path):
     """By name, by another spelling, by a link; two outputs; but not two devices."""
     source = tmp_path / 'in.csv'
     source.write_text('x')
@@ -60,14 +59,9 @@ def test_paths_that_collide_or_are_empty_are_named(tmp_path):
     new = str(tmp_path / 'new')
     with pytest.raises(InputError, match='--json and --report are both'):
         output.check_paths({}, {'--json': new, '--report': new})
-    for inputs, outputs in (({'RECORDING': ''}, {}), ({}, {'--json': ''})):
-        with pytest.raises(InputError, match='(RECORDING|--json): the path is empty'):
-            output.check_paths(inputs, outputs)
     output.check_paths({'RECORDING': str(source), '--model': None},
                        {'--json': '-', '--report': new, '--save-model': None})
     output.check_paths({}, {'--json': '/dev/null', '--report': '/dev/null'})
-    with pytest.raises(argparse.ArgumentTypeError, match='empty'):
-        output.path_argument('')
 
 
 @pytest.mark.parametrize('name, part', [
@@ -148,17 +142,12 @@ def test_a_fifo_is_no_bag_and_hangs_nothing(tmp_path):
     with pytest.raises(InputError, match='neither a file nor a folder'):
         with output.replacing(fifo, force=True):
             pytest.fail('it is not replaced')
-    with pytest.raises(InputError, match='cannot write'):
-        output.write_text('nobody reads this', fifo, force=True)
 
 
-def test_an_output_within_another_or_around_an_input_is_refused(tmp_path):
-    bag, log = bag_folder(tmp_path / 'bag', 'old'), tmp_path / 'logs' / 'log.csv'
+def test_an_output_around_an_input_is_refused(tmp_path):
+    log = tmp_path / 'logs' / 'log.csv'
     log.parent.mkdir()
     log.write_text('x')
-    for inner in ('bag_0.mcap', 'metadata.yaml', 'deep/x.json'):
-        with pytest.raises(InputError, match='would lie in the bag'):
-            output.check_paths({}, {'--output': bag, '--json': bag / inner}, force=True)
     with pytest.raises(InputError, match='would overwrite LOG'):
         output.check_paths({'LOG': log}, {'OUT': log.parent}, force=True)
 
