@@ -175,7 +175,6 @@ class AdaptiveFilterNode(MonitorNode):
     FIXED = (*INPUT_PARAMETERS, _MODE, *MOTOR_PARAMETERS)
 
     def start(self) -> None:
-        """Begin without any filtered message."""
         self._channels: Channels | None = None
         self._filters: list[AdaptiveLowPass] = []
         values = self.values()
@@ -207,12 +206,10 @@ class AdaptiveFilterNode(MonitorNode):
         self.publish_every(self._publish)
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise `ValueError` when the parameters contradict each other."""
         FilterSettings(**_filter_options(values))
         NotchSettings.from_options(notch_options(values))
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Apply checked parameters; the output does not jump."""
         super().apply(values)
         for channel in (self._idle, *self._filters):
             channel.configure(**_filter_options(values))
@@ -398,7 +395,6 @@ class AdaptiveFilterNode(MonitorNode):
 
 
 def _unknown(supply: SupplyEstimate) -> str:
-    """Return why sigma is unknown, as a clause."""
     return supply.why or 'sigma was unknown at the last message'
 
 

@@ -54,7 +54,6 @@ class AdcNode(MonitorNode):
     FIXED = ADC_PARAMETERS
 
     def start(self) -> None:
-        """Open the device, and read it in a thread."""
         values = self.values()
         self._gain, self._shift = values['gain'], values['offset']
         folder = find_device(values['device'], Path(values['sysfs']))
@@ -85,7 +84,6 @@ class AdcNode(MonitorNode):
         self.run_beside(work)
 
     def _read(self) -> None:
-        """Publish blocks until the end."""
         assert self._buffer is not None
         message = JointState(name=[self._channel])
         for block in self._buffer.blocks():
@@ -105,7 +103,6 @@ class AdcNode(MonitorNode):
         self._silence.record()
 
     def _poll(self, polled: PolledChannel) -> None:
-        """Publish samples at the polling rate until the end."""
         message = battery(self._channel)
         due = time.monotonic()
         while wait_until(due, lambda: not self.ending.is_set()):

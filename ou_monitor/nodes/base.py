@@ -239,12 +239,10 @@ class MonitorNode(Node):
         return (s for s in super().subscriptions if s not in self._polled)
 
     def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
-        """Return a publisher."""
         return self._kept(super().create_publisher(kind, topic, qos, **options))
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any,
                             **options: Any) -> Subscription:
-        """Return a subscription."""
         return self._kept(super().create_subscription(kind, topic, callback, qos, **options))
 
     def serve(self, name: str, work: Callable[[], str]) -> None:
@@ -258,7 +256,6 @@ class MonitorNode(Node):
         self.create_service(Trigger, name, self.guarded(answer))
 
     def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
-        """Return a service."""
         return self._kept(super().create_service(kind, name, callback, **options))
 
     def _kept(self, made: Any) -> Any:
@@ -370,7 +367,6 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             change.callback = answer
 
         def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Check that the node can begin: begin, then stop."""
             def tried() -> None:
                 self.begin()
                 self.stop()

@@ -39,7 +39,6 @@ _ALIVE = 5.0
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command."""
     if not args.host:
         raise InputError('--host: the address is empty; 0.0.0.0 listens on all addresses')
     try:
@@ -79,7 +78,6 @@ def _local(host: str) -> bool:
 
 
 async def _page(node: Any, host: str, port: int) -> None:
-    """Serve until the context of the node ends."""
     token = '' if _local(host) else secrets.token_urlsafe(16)
     server = make_server(application(node, token))
     try:

@@ -196,7 +196,6 @@ class Player(Node):
         return summary
 
     def _wait_for_subscriber(self) -> None:
-        """Wait for a subscriber, so that it receives the first samples."""
         until = time.monotonic() + self._options.wait
         while self.going() and time.monotonic() < until:
             if any(output.get_subscription_count() for output in self._outputs.values()):
@@ -244,7 +243,6 @@ class Player(Node):
         self._passes += 1
 
     def _tick(self, origin: int, start: float) -> None:
-        """Publish the present time of the schedule on /clock."""
         if self._clock_output is None:
             return
         now = origin + round((time.monotonic() - start) * self._options.rate * 1e9)

@@ -21,10 +21,7 @@ NAME = 'ou_replay'
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that reports an error in one line."""
-
     def error(self, message: str) -> Any:
-        """Raise the error for the caller to report."""
         raise InputError(f'{message} (see --help)')
 
 
@@ -83,7 +80,6 @@ def _work() -> int:
 
 
 def main() -> int:
-    """Run the executable; return the exit status."""
     if any(word in ('-h', '--help') for word in sys.argv[1:]):
         parser().print_help()
         return 0

@@ -119,7 +119,6 @@ class SupplySimulatorNode(MonitorNode):
     FIXED = (*_SOURCES, *FIXED_PARAMETERS)
 
     def start(self) -> None:
-        """Read the model and begin."""
         values = {**self.values(), 'adc.sample_rate': 0.0}
         self._lock = threading.Lock()
         if not values['model_file']:
@@ -154,11 +153,9 @@ class SupplySimulatorNode(MonitorNode):
         self.run_beside(self._run)
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Apply the resistance."""
         self._run_now.simulation.resistance = values['scale_resistance']
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise `ValueError` when the parameters cannot be used."""
         if -1.0 < values['capacity_left'] < 0.0:
             raise ValueError('capacity_left must lie within 0..1, or be -1')
 
@@ -195,7 +192,6 @@ class SupplySimulatorNode(MonitorNode):
     # -- throttle
 
     def _watch(self) -> None:
-        """Check the publishers of throttle, 5 times a second."""
         if self._played is None:
             self._sources.watch('throttle')
         self._watched.look(self._input)
@@ -223,7 +219,6 @@ class SupplySimulatorNode(MonitorNode):
             self._piece()
 
     def _piece(self) -> None:
-        """Draw the next samples and publish each when it is due."""
         now = self.stamp_now()
         if now <= 0.0 or self.problem:
             time.sleep(NAP)

@@ -35,7 +35,6 @@ _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
 
 
 def analysis_document(analysis: Analysis) -> Document:
-    """Return the report of an analysis."""
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
     subject = (f'{recording.name}: {recording.n} samples in '
@@ -88,7 +87,6 @@ def _low_limit(analysis: Analysis) -> list[str]:
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
-    """Return the facts as names and words."""
     found = known_lines(analysis.overview)
     if not found:
         return []
@@ -254,7 +252,6 @@ def _caution(item: QualityItem) -> str:
 
 
 def _by_throttle(analysis: Analysis) -> Part:
-    """Return the table of sag, noise and risk over throttle."""
     curves, sag, noise = (analysis.by_throttle, analysis.overview.facts.sag,
                           analysis.overview.facts.noise)
     if math.isnan(noise.flown[0]):
@@ -393,7 +390,6 @@ def _interval(level: LevelResult, name: str) -> str:
 
 
 def _process(analysis: Analysis) -> list[Part]:
-    """Return the tests that decide the type of process of each level, and the reasons."""
     rows = [[level.label, *(
         chance(test.p_adjusted) + ' *' * test.rejects
         + (f'\n{number(test.effect, 2)}' if math.isfinite(test.effect) else '')

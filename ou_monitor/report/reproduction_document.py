@@ -21,7 +21,6 @@ _BINS = 40  # Of the histogram of crest factors
 
 
 def reproduction_document(result: Reproduction) -> Document:
-    """Return the report of a reproduction."""
     parts: list[Part] = [
         lambda: [Section('Figures, simulated from the numbers printed', [
             *_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)])],
@@ -127,7 +126,6 @@ def _spectrum(result: Reproduction) -> list[Part]:
 
 
 def _crest_and_factor(result: Reproduction) -> list[Part]:
-    """Return the plots of the crest factors, and of the variance that tests equation (6)."""
     crests = Plot('Vpp/Vrms of one OU', 'Vpp/Vrms', 'density', width=450, height=300)
     edges = np.linspace(2.5, 10.0, 1 + _BINS)
     for k, (ms, values) in enumerate(sorted(result.crests.by_screen.items())):
