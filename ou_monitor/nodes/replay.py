@@ -21,6 +21,7 @@ NAME = 'ou_replay'
 
 
 class _Parser(argparse.ArgumentParser):
+
     def error(self, message: str) -> Any:
         raise InputError(f'{message} (see --help)')
 
