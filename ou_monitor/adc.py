@@ -298,7 +298,6 @@ class IioBuffer:
         return wanted
 
     def _stamp_clock(self) -> int | None:
-        """Return the clock of the timestamps; None without timestamps."""
         if all(element.name != STAMP for element in self._elements):
             return None
         path = self._folder / 'current_timestamp_clock'

@@ -251,7 +251,6 @@ class BagReader:
 
 
 def _same_fields(schema: Any, other: Any) -> bool:
-    """Return whether two definitions of a type have the same fields."""
     with suppress(Exception):
         one, two = (parse_definition(each.name, each.data.decode('utf-8', 'replace'))
                     for each in (schema, other))
@@ -432,7 +431,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         }}
 
     def _remove(self) -> None:
-        """Remove the files that this object has written."""
         # On a full disk closing fails too, because the buffer cannot be flushed.
         with suppress(OSError):
             self._file.close()
@@ -442,7 +440,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self, kind: type[BaseException] | None, error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish the bag, or remove it when the block failed."""
         if kind is None:
             self.close()
         else:

@@ -79,7 +79,6 @@ def _absolute(topic: str) -> str:
 
 
 def _by_name(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
-    """Return the topics that match a spec by name and type."""
     exact = _absolute(spec.topic)
     if topics.get(exact) == spec.type:
         return [exact]
@@ -133,7 +132,6 @@ def _throttle(
     path: Path, config: MsgConfig, topics: Mapping[str, str], voltage: str,
     throttle_topic: str | None,
 ) -> tuple[FieldSpec | None, tuple[str, ...]]:
-    """Return the field of the throttle, or a note why it is unknown."""
     spec = config.throttle
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
@@ -276,7 +274,6 @@ def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArr
 
 def _source(bag: BagReader, specs: Mapping[str, FieldSpec], config: MsgConfig, name: str,
             ) -> dict[str, str]:
-    """Return topics, types, files and metadata of the bag."""
     source = {**bag.about, 'file': name, 'format': 'mcap', 'msg_config': config.name}
     for which in (VOLTAGE, THROTTLE):
         spec = specs.get(which)
@@ -315,7 +312,6 @@ def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
 
 
 def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:
-    """Return the topic and the field that a signal names."""
     wanted = _absolute(signal)
     if topics.get(wanted) in _SCALARS:
         return wanted, 'data'

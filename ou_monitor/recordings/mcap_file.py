@@ -201,7 +201,6 @@ class McapFile:
         bisect.insort(self.breaks, (offset, str(why)))
 
     def _read_summary(self, file: BinaryIO) -> Any:
-        """Return the summary section, or None where it is missing or damaged."""
         file.seek(max(0, self._size - _FOOTER))
         footer = file.read(_FOOTER)
         if not (footer.startswith(_HEAD.pack(Opcode.FOOTER, 20)) and footer.endswith(MAGIC)):
@@ -345,7 +344,6 @@ class McapFile:
         return file.read(length)
 
     def _learn(self, op: int, content: bytes) -> None:
-        """Register a schema or a channel; Damage if unreadable or defined differently before."""
         kind: Any = Schema if op == Opcode.SCHEMA else Channel
         found = _parse(kind, content)
         known = (self._schemas if kind is Schema else self._channels).get(found.id, found)
@@ -380,7 +378,6 @@ class McapFile:
                     most_bytes=MOST_BYTES, most_nodes=MOST_NODES))
 
     def _add_channel(self, channel: Channel) -> None:
-        """Register a channel, once."""
         if channel.id in self._channels:
             return
         self._channels[channel.id] = channel
@@ -444,7 +441,6 @@ class McapFile:
         return at + length
 
     def _add_span(self, table: MessageTable, span: Span) -> None:
-        """Add the messages of a span to the index."""
         keys, counts = np.unique(table.channel, return_counts=True)
         for key, n in zip(keys.tolist(), counts.tolist()):
             if key not in self._channels and self._summary is not None and (
@@ -487,7 +483,6 @@ class McapFile:
         return data
 
     def _messages(self, data: bytes, index: bytes = b'') -> MessageTable:
-        """Return the messages of a chunk; register its schemas and channels."""
         places, others, reached = _by_index(data, index) or _records(data)
         if reached < len(data):
             raise Damage('a record within it is cut off')
@@ -514,7 +509,6 @@ class McapFile:
         return {name: table.where(mine) for name, mine in topics.items()}
 
     def _table_of(self, file: BinaryIO, span: Span) -> MessageTable:
-        """Return the messages of a span."""
         try:
             data = self._data(file, span)
             file.seek(span.offset + span.length)

@@ -126,7 +126,6 @@ def write_recording(
 
 
 def _pieces(rec: Recording | Iterable[Recording]) -> Iterator[Recording]:
-    """Yield the pieces of a recording that hold a sample."""
     if not isinstance(rec, Recording):
         yield from (piece for piece in rec if piece.n)
         return
@@ -141,7 +140,6 @@ def _timed(topic: int, messages: Iterable[tuple[int, bytes]]) -> Iterator[Timed]
 
 
 def _moved(shift: int) -> tuple[str, ...]:
-    """Return the note on stamps moved by a time, ns."""
     return (f'Stamps were moved by {shift * 1e-9:.9f} s: a bag cannot hold negative ones.',
             ) if shift else ()
 
@@ -206,7 +204,6 @@ def write_log(
 
 
 def _messages(place: int, kind: str, stamps: Stamps, one: Series) -> Iterator[Timed]:
-    """Yield the messages of one topic."""
     motors = one.name.split(', ')
     for first in range(0, stamps.size, SLICE):
         part = slice(first, first + SLICE)

@@ -262,7 +262,6 @@ def topic_of(name: str) -> str:
 
 
 def _unused_topic(topic: str, taken: set[str]) -> str:
-    """Return a topic that is not taken."""
     if topic in taken:
         topic = f'signal/{topic}'
     number, free = 2, topic

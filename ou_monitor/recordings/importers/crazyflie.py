@@ -53,7 +53,6 @@ _UNITS = {**{f'{_GYRO}.{axis}': ('rad/s', DEGREE) for axis in 'xyz'},
 
 
 class _Event(NamedTuple):
-    """Layout of the records of one event."""
 
     name: str
     row: np.dtype[np.void]
@@ -93,7 +92,6 @@ def read(path: Path, request: Request) -> Log:
 
 
 def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int, _Event], int]:
-    """Return the events by number, and the first byte of their records."""
     at = 5
     events: dict[int, _Event] = {}
 
@@ -164,7 +162,6 @@ def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Itera
 
 
 def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
-    """Yield the gyro with the accelerometer."""
     rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'], factor)
                      for group, factor in ((_GYRO, DEGREE), (_FORCE, GRAVITY)))
     return gyro_of(

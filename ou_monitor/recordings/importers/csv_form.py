@@ -238,7 +238,6 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
 
 
 def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
-    """Return the cells of each line; comments and lines that cannot be split have none."""
     rows: list[list[str]] = []
     for line in lines:
         try:
@@ -269,7 +268,6 @@ def _joined(row: list[str], names: int) -> list[str]:
 
 
 def _trimmed(row: list[str]) -> list[str]:
-    """Return a row without the blank cells at its end."""
     return row[:max((k + 1 for k, cell in enumerate(row) if cell), default=0)]
 
 
@@ -414,7 +412,6 @@ def _names_in_rows(rows: list[list[str]], width: int) -> list[str]:
 
 
 def _is_battery_state(row: list[str]) -> bool:
-    """Return whether the cells are a sensor_msgs/BatteryState."""
     counts = [*row[:2], *row[10:13]]
     return row[13:14] in (['True'], ['False']) and all(map(str.isdigit, counts)) and all(
         is_number(cell) or is_missing(cell) for cell in row[3:10])

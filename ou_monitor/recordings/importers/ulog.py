@@ -153,7 +153,6 @@ def read(path: Path, request: Request) -> Log:
 
 
 def _topics(names: frozenset[str]) -> list[str]:
-    """Return the default topics and the topics of the named series."""
     return list(dict.fromkeys((*TOPICS, *(re.split(r'[.\[]', name)[0] for name in names))))
 
 
@@ -223,7 +222,6 @@ def _facts(ulog: Any) -> dict[str, str]:
 
 
 def _started(ulog: Any) -> dict[str, str]:
-    """Return the date of the start by the first GPS time."""
     for data in ulog.data_list:
         if data.name == CLOCK and UTC in data.data:
             known = np.flatnonzero(data.data[UTC])
@@ -258,7 +256,6 @@ def _series(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[
 
 
 def _stack(columns: Columns, stem: str) -> FloatArray:
-    """Return the elements of an array field as rows."""
     rows: list[FloatArray] = []
     while f'{stem}[{len(rows)}]' in columns:
         rows.append(columns[f'{stem}[{len(rows)}]'])
