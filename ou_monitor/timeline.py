@@ -31,8 +31,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import (
-    as_numbers, Counters, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, NAN, Note,
-    Recording)
+    as_numbers, Counters, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, MOST_STAMP, NAN,
+    Note, Recording)
 from ou_monitor.text import counted, percent
 
 # Minimum pause, in median steps.
@@ -477,6 +477,15 @@ def plausible(values: FloatArray, most: float) -> FloatArray:
     # Comparisons with NaN are false, so NaN stays.
     beyond = (values > most) | (values < -most)
     return np.where(beyond, NAN, values) if beyond.any() else values
+
+
+def plausible_stamps(name: str, t: FloatArray) -> FloatArray:
+    """Return stamps, s, with NaN for implausible ones; refuse a file that has no others."""
+    found = plausible(t, MOST_STAMP)
+    if not np.isfinite(found).any() and (stamps := t[np.isfinite(t)]).size:
+        raise InputError(f'{name}: stamps of {stamps[0]:.4g} s are implausible: is the time in '
+                         'ms, us or ns? Give --time-unit for a CSV')
+    return found
 
 
 def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:

@@ -21,13 +21,13 @@ from ou_monitor.recordings.bag import BagReader, read_fields
 from ou_monitor.recordings.cdr import (
     Field, FieldColumn, short_name, TimeArray, value_path)
 from ou_monitor.recordings.importers.log import (
-    CURRENT, RawColumns, Series, SIGNAL, THROTTLE, UNKNOWN, unusable_words, VOLTAGE)
+    CURRENT, Series, SIGNAL, THROTTLE, UNKNOWN, unusable_words, VOLTAGE)
 from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
-from ou_monitor.records import Defect, defect_of, FloatArray, Note
+from ou_monitor.records import Defect, defect_of, FloatArray, Note, Recording
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import clock_of, ThrottleHold
 from ou_monitor.text import counted, outside_words, part_words, printable, some
-from ou_monitor.timeline import back_words, BATCH, check_throttle
+from ou_monitor.timeline import back_words, BATCH, check_throttle, plausible_stamps
 
 
 def choose(
@@ -169,7 +169,7 @@ _SCALARS = (FLOAT32, FLOAT64)
 def read_bag(
     path: Path, *, partial: bool, start: float | None, end: float | None,
     progress: Callable[[float], None] | None, **of_bags: Any,
-) -> RawColumns:
+) -> Recording:
     """Read voltage, throttle and current of a bag, start and end in s; see `read_recording`."""
     bag = BagReader(path, partial=partial)
     config, specs, said = choose(bag.path, bag.topics, **of_bags)
@@ -245,8 +245,8 @@ def read_bag(
     if CURRENT in holds:
         current = holds[CURRENT].at(t)
     throttle = holds[THROTTLE].at(t) if THROTTLE in holds else np.full(t.size, np.nan)
-    return RawColumns(t, volts, throttle, current, name, _source(bag, specs, config, name),
-                      tuple(notes))
+    return Recording(plausible_stamps(name, t), volts, throttle, name,
+                     _source(bag, specs, config, name), tuple(notes), current)
 
 
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,

@@ -21,8 +21,8 @@ from ou_monitor.recordings.importers.choose import (
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import BAG, CSV, import_log, kind_of
 from ou_monitor.recordings.importers.log import (
-    CsvColumns, Log, RawColumns, Request, Series, SIGNAL, unusable_words)
-from ou_monitor.records import clock_unit, MOST_STAMP, Recording
+    CsvColumns, Log, Request, Series, SIGNAL, unusable_words)
+from ou_monitor.records import clock_unit, Recording
 from ou_monitor.text import outside_words, part_words
 from ou_monitor.timeline import (
     check_stamps, check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of,
@@ -137,31 +137,27 @@ def _read_log(path: Path, signal: str | None, columns: CsvColumns | None, flight
     return whole, log
 
 
-def tidy(raw: RawColumns) -> Recording:
+def tidy(raw: Recording) -> Recording:
     """Return a `Recording` in order, each stamp once, with notes on dropped samples."""
-    name = raw.name
-    check_throttle(name, raw.throttle, raw.voltage)
-    t = plausible(raw.t, MOST_STAMP)
-    throttle = plausible(raw.throttle, MOST_THROTTLE)
-    if not np.isfinite(t).any() and (stamps := raw.t[np.isfinite(raw.t)]).size:
-        raise InputError(f'{name}: stamps of {stamps[0]:.4g} s are implausible: is the time in '
-                         'ms, us or ns? Give --time-unit for a CSV')
-    which, said = in_order(t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
-    notes, t = [*raw.notes, *said], t[which]
-    if not t.size:
-        raise InputError(unusable_words(name, notes))
+    check_throttle(raw.name, raw.throttle, raw.voltage)
+    which, said = in_order(raw.t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
+    found = part_of(raw, which, *said)
+    if not found.n:
+        raise InputError(unusable_words(raw.name, found.notes))
     if said:
-        check_stamps(name, raw.t, raw.voltage)
+        check_stamps(raw.name, raw.t, raw.voltage)
+    t, notes, current = found.t, found.notes, found.current
     # The unit is certain if the stamps are dates or the source states it.
     stated = clock_unit(t[0]) or 'time_unit' in raw.source
     # Cheap test first: with this median spacing, the mean is at least half of it.
     if (t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and not stated
             and (spacing := float(np.median(np.diff(t)))) >= _SPARSE):
-        notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
-                     'Give --time-unit for a CSV.')
-    current = None if raw.current is None else plausible(raw.current[which], MOST_CURRENT)
-    return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
-                     None if current is None or np.isnan(current).all() else current)
+        notes = (*notes, f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
+                         'Give --time-unit for a CSV.')
+    if current is not None:
+        current = plausible(current, MOST_CURRENT)
+    return replace(found, throttle=plausible(found.throttle, MOST_THROTTLE), notes=notes,
+                   current=None if current is None or np.isnan(current).all() else current)
 
 
 def _check_part(start: float | None, end: float | None) -> None:

@@ -18,10 +18,10 @@ import re
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, IMU, Log, RawColumns, Series, SPEEDS, THROTTLE, UNKNOWN, VOLTAGE)
-from ou_monitor.records import Defect, FloatArray, Note, prefixed
+    ANY, clean, CURRENT, IMU, Log, Series, SPEEDS, THROTTLE, UNKNOWN, VOLTAGE)
+from ou_monitor.records import Defect, FloatArray, Note, prefixed, Recording
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline import check_throttle
+from ou_monitor.timeline import check_throttle, plausible_stamps
 
 # Name by which the user leaves a quantity out.
 NONE = 'none'
@@ -85,7 +85,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     return ChosenSeries(usable[VOLTAGE], usable.get(THROTTLE), usable.get(CURRENT), tuple(notes))
 
 
-def columns_of(path: Path, log: Log, chosen: ChosenSeries) -> RawColumns:
+def columns_of(path: Path, log: Log, chosen: ChosenSeries) -> Recording:
     """Return the samples of a log, rounded as in the bag that `convert` writes."""
     volts = chosen.voltage
     t = _in_a_bag(volts.t)
@@ -97,11 +97,11 @@ def columns_of(path: Path, log: Log, chosen: ChosenSeries) -> RawColumns:
             held[one.quantity] = np.append(np.nan, _single(one.values))[place]
             taken[one.quantity] = one.name
     unknown = np.full(volts.n, np.nan)
-    return RawColumns(
-        t, _single(volts.values), held.get(THROTTLE, unknown), held.get(CURRENT, unknown),
-        printable(path.name),
-        {'file': printable(path.name), 'format': log.format, **taken, **log.facts},
-        (*log.notes, *chosen.notes))
+    name = printable(path.name)
+    return Recording(
+        plausible_stamps(name, t), _single(volts.values), held.get(THROTTLE, unknown), name,
+        {'file': name, 'format': log.format, **taken, **log.facts},
+        (*log.notes, *chosen.notes), held.get(CURRENT, unknown))
 
 
 def _in_a_bag(t: FloatArray) -> FloatArray:

@@ -31,11 +31,11 @@ from ou_monitor.recordings.importers.csv_form import (
 from ou_monitor.recordings.importers.csv_units import (
     FileColumn, in_si, lower_rows, PULSE_WORDS, stamps_of, unwrapped)
 from ou_monitor.recordings.importers.log import (
-    ANY, CsvColumns, Log, RawColumns, Request, Series)
+    ANY, CsvColumns, Log, Request, Series)
 from ou_monitor.records import (
-    clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
+    clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, Recording, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline import hold, spread, WILD
+from ou_monitor.timeline import hold, plausible_stamps, spread, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'
@@ -124,7 +124,7 @@ class _Table(NamedTuple):
 
 
 def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = False,
-             ) -> RawColumns:
+             ) -> Recording:
     """Read the samples of a supply, unsorted, with NaN kept (partial: leave out bad lines)."""
     left_out: list[str] | None = [] if partial else None
     table = _table(path, columns or CsvColumns(), left_out=left_out)
@@ -161,7 +161,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
         t, volts, throttle, current = (one[filled] for one in (t, volts, throttle, current))
     if t.size >= _FEW_ROWS and 2 * np.unique(t).size < t.size:
         said.append('Most rows repeat the last stamp: if evenly spaced, give --sample-interval.')
-    return RawColumns(t, volts, throttle, current, name, source, tuple(said))
+    return Recording(plausible_stamps(name, t), volts, throttle, name, source, tuple(said),
+                     current)
 
 
 def read(path: Path, request: Request) -> Log:

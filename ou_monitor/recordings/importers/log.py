@@ -116,20 +116,6 @@ class Log:
     names: tuple[str, ...] = ()  # Names of all series of the file, unread ones included
 
 
-@dataclass(frozen=True, eq=False)
-class RawColumns:
-    """Samples of a supply as a file holds them: unsorted, with repeated stamps."""
-
-    t: FloatArray  # Stamps, s; NaN if unknown
-    voltage: FloatArray  # V, with all repeats of the logger; NaN if unknown
-    throttle: FloatArray  # 0..1, held from its last value on; NaN if unknown
-    # A, positive while the battery is drained; NaN if unknown; None: unknown throughout.
-    current: FloatArray | None
-    name: str  # Name of the file, printable
-    source: dict[str, str]  # Origin: file, format, chosen series, firmware
-    notes: tuple[str, ...] = ()  # Dropped or unreadable parts, one sentence each
-
-
 def unusable_words(name: str, notes: Iterable[str]) -> str:
     """Return the text of the error for a file without usable samples, with what was dropped."""
     why = ' '.join(note for note in notes if defect_of(note).drops)
