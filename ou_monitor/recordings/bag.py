@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from mcap.writer import CompressionType, Writer
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    Definitions, FieldColumn, FieldReader, joined_columns, MessageTable)
+    Definitions, ColumnBuffer, FieldColumn, FieldReader, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
@@ -280,14 +280,14 @@ def read_fields(
         return FieldReader(spec, bag.definitions(spec.type), refuse, second)
 
     readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}
-    found: dict[str, list[FieldColumn]] = {name: [] for name in specs}
+    found = {name: ColumnBuffer(bag.counts[spec.topic]) for name, spec in specs.items()}
     counts = dict.fromkeys(specs, 0)
     for part in bag.tables([spec.topic for spec in specs.values()], end_ns, as_written=True):
         for name, reader in readers.items():
             table = part.tables.get(reader.spec.topic)
             if table is not None:
                 counts[name] += table.n
-                found[name].append(reader.read(table))
+                found[name].add(reader.read(table))
         if progress is not None:
             progress(part.done)
     for name, spec in specs.items() if end_ns is None else ():
@@ -296,11 +296,11 @@ def read_fields(
             raise InputError(
                 f"{bag.path} is damaged: it states {stated} messages of topic '{spec.topic}', "
                 f'{counts[name]} were found; use --partial to read the intact part')
-    return {name: joined_columns(parts) for name, parts in found.items()}
+    return {name: buffer.whole() for name, buffer in found.items()}
 
 
 # Chunks are read together up to this size, bytes unpacked.
-_TOGETHER = 2 * 1024 * 1024
+_TOGETHER = 1024 * 1024
 
 # Small, because a brown-out costs a recording its last chunk, about a second at 1 kHz.
 CHUNK_SIZE = 128 * 1024  # bytes

@@ -130,9 +130,12 @@ class Place:
     size: int | None = None  # Number of elements; None for a single number that is not an array
 
     def column(self, rows: Rows) -> FloatArray:
-        """Return the numbers of many messages."""
+        """Return the numbers of many messages, NaN where not finite."""
         raw = self._view(rows)
-        return (raw != 0 if self.kind.endswith('?') else raw).astype(np.float64)
+        found = (raw != 0 if self.kind.endswith('?') else raw).astype(np.float64)
+        if not (finite := np.isfinite(raw)).all():
+            found[~finite] = np.nan
+        return found
 
     def fill(self, rows: Rows, values: npt.ArrayLike) -> None:
         """Write the numbers of many messages."""
@@ -358,17 +361,35 @@ _NO_MESSAGE = FieldColumn(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bo
                           np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 
-def joined_columns(parts: list[FieldColumn]) -> FieldColumn:
-    """Join parts; their list is emptied, because parts and whole would take twice the memory."""
-    columns: list[Any] = [list(pieces) for pieces in zip(_NO_MESSAGE, *parts)]
-    parts.clear()
-    for k, (_, *pieces) in enumerate(columns):
-        if pieces and not any(piece.strides[0] for piece in pieces):
-            # All parts are views of one value: join them as a view of it.
-            columns[k] = np.broadcast_to(pieces[0][0], sum(piece.size for piece in pieces))
-        else:
-            columns[k] = np.concatenate(columns[k])
-    return FieldColumn(*columns)
+class ColumnBuffer:
+    """The columns of many parts, joined as they come (messages: their expected number)."""
+
+    def __init__(self, messages: int) -> None:
+        self._messages = messages
+        self._store: list[npt.NDArray[Any]] = list(_NO_MESSAGE)
+        self._sizes = [0] * len(self._store)
+
+    def add(self, part: FieldColumn) -> None:
+        """Append a part."""
+        share = self._messages / max(part.n, 1)
+        for k, piece in enumerate(part):
+            store, size = self._store[k], self._sizes[k]
+            self._sizes[k] += piece.size
+            if not piece.strides[0] and (not size or not store.strides[0]):
+                # Views of one value: join them as a view of it.
+                self._store[k] = np.broadcast_to(piece[:1], self._sizes[k]) if piece.size else store
+                continue
+            n = self._sizes[k]
+            if n > store.size or not store.flags.writeable:
+                # Parts and whole would take twice the memory; a bag may overstate its messages.
+                whole = np.empty(max(2 * n, min(int(share * piece.size), 16 * n)), piece.dtype)
+                whole[:size] = store[:size]
+                self._store[k] = store = whole
+            store[size:n] = piece
+
+    def whole(self) -> FieldColumn:
+        """Return all parts as one."""
+        return FieldColumn(*(store[:size] for store, size in zip(self._store, self._sizes)))
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
@@ -507,7 +528,7 @@ class FieldReader:
             return np.nan
         whole, *nano = (layout.places[path].column(rows) for path in self._stamp)
         own = whole + 1e-9 * nano[0] if nano else whole * self.spec.stamp_factor
-        own[~np.isfinite(own) | (own == 0.0)] = np.nan
+        own[own == 0.0] = np.nan
         return own
 
     @staticmethod
@@ -522,7 +543,4 @@ class FieldReader:
             block *= spec.sign * spec.unit_factor
         if spec.offset:
             block += spec.offset
-        finite = np.isfinite(block)
-        if not finite.all():
-            block[~finite] = np.nan
         return block

@@ -32,7 +32,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, MessageIndex, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
@@ -45,6 +45,8 @@ import zstandard
 
 # Opcode and length of a record; channel, sequence, log time and publish time of a message.
 _HEAD, _MESSAGE = struct.Struct('<BQ'), struct.Struct('<HIQQ')
+# Unpacked size, checksum, and length of the compression's name, behind two log times.
+_CHUNK = struct.Struct('<16xQII')
 _FOOTER = _HEAD.size + 20 + len(MAGIC)
 # Offset of the message in its record.
 _DATA = _HEAD.size + _MESSAGE.size
@@ -57,7 +59,6 @@ _IN_DATA = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode
             Opcode.FOOTER}
 _IN_SUMMARY = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
                Opcode.STATISTICS, Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER}
-_UNREAD: dict[int, Any] = {Opcode.ATTACHMENT: Attachment, Opcode.MESSAGE_INDEX: MessageIndex}
 _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
 # Key in a channel's metadata: rate of the samples within a block, Hz.
@@ -261,7 +262,6 @@ class McapFile:
         """Walk the file once; note the places of its messages and its damage."""
         starts = list(chunks)
         statistics: Any = None if self._summary is None else self._summary.statistics
-        private = False
         at, op, in_data = len(MAGIC), 0, True
         while op != Opcode.FOOTER and len(self.breaks) < _MOST_BREAKS:
             place = bisect.bisect_right(starts, at)
@@ -301,14 +301,6 @@ class McapFile:
                         self._learn(op, self._content(file, length, self._limit))
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
-                elif op in _UNREAD and statistics is None and not (
-                        self.spans and self.spans[-1].chunk):
-                    # Without a count of messages, check that a damaged opcode hides none.
-                    _parse(_UNREAD[op], self._content(file, length, self._limit))
-                elif op >= _PRIVATE and statistics is None and not private:
-                    private = True
-                    raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
-                                 'message, and no count shows whether one is missing')
             except Damage as error:
                 # The frame is whole: later records may be intact.
                 self._break(at, error)
@@ -467,18 +459,25 @@ class McapFile:
             raise Damage(f'it is cut off after {len(content)} bytes')
         if not span.chunk:
             return content
-        chunk = _parse(Chunk, content)
-        stated = chunk.uncompressed_size
+        try:
+            stated, crc, name = _CHUNK.unpack_from(content)
+            begin = _CHUNK.size + name + 8
+            packed, = struct.unpack_from('<Q', content, begin - 8)
+        except struct.error as error:
+            raise Damage('it is shorter than its own head') from error
+        if packed != len(content) - begin:
+            raise Damage(f'it holds {len(content) - begin} bytes in place of {packed}')
         if stated > self._limit:
             raise Damage(_over_limit('it unpacks to', stated, self._limit))
         try:
-            data = _decompressed(chunk.compression, chunk.data, stated, self._zstd)
+            data = _decompressed(content[_CHUNK.size:begin - 8].decode('latin-1'),
+                                 memoryview(content)[begin:], stated, self._zstd)
         # zstd and lz4 raise their own errors.
         except Exception as error:
             raise Damage(printable(error, 200) or type(error).__name__) from error
         if len(data) != stated or span.unpacked not in (0, stated):
             raise Damage(f'{len(data)} bytes in place of {span.unpacked or stated}')
-        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        if crc and crc != zlib.crc32(data):
             raise Damage('its checksum is wrong')
         return data
 
@@ -597,7 +596,7 @@ def _crc(file: BinaryIO, length: int) -> int:
     return found
 
 
-def _decompressed(compression: str, data: bytes, stated: int,
+def _decompressed(compression: str, data: memoryview, stated: int,
                   zstd: zstandard.ZstdDecompressor) -> bytes:
     """Return the content of a chunk, unpacked to at most its stated size."""
     if compression == 'zstd':
@@ -612,10 +611,10 @@ def _decompressed(compression: str, data: bytes, stated: int,
         if not frame.eof:
             raise Damage(f'it does not unpack to {stated} bytes')
     elif compression == '':
-        plain = data
+        plain = bytes(data)
     else:
         # The library treats unknown compressions as plain bytes.
-        raise Damage(f"unknown compression '{compression}'")
+        raise Damage(f"unknown compression '{printable(compression, 40)}'")
     return plain
 
 

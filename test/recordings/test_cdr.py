@@ -8,8 +8,7 @@ from made_bags import decode, encode, encode_block
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
-from ou_monitor.recordings.cdr import (
-    FieldReader, joined_columns, MessageTable, seconds)
+from ou_monitor.recordings.cdr import ColumnBuffer, FieldReader, MessageTable, seconds
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS
 from ou_monitor.stream.config import FieldSpec, parse_field_path, walk
 import pytest
@@ -317,7 +316,10 @@ def test_time_order_keeps_the_fields_of_a_message_together():
     assert column.values.tolist() == [1, 2, 2, 2, 4, 4, 0, 0]
     first, rest = column.split(3)
     assert (first.values.tolist(), rest.log_time.tolist()) == ([1, 2, 2, 2], [20, 30])
-    whole = joined_columns([first, rest, first._replace(beside=np.arange(3.0))])
+    buffer = ColumnBuffer(6)
+    for part in (first, rest, first._replace(beside=np.arange(3.0))):
+        buffer.add(part)
+    whole = buffer.whole()
     for name in column._fields:
         np.testing.assert_array_equal(getattr(whole.split(5)[0], name), getattr(column, name))
     assert whole.counts.tolist()[5:] == [0, 1, 3] and whole.beside.tolist()[5:] == [0, 1, 2]
