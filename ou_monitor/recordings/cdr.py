@@ -377,7 +377,8 @@ class ColumnBuffer:
             self._sizes[k] += piece.size
             if not piece.strides[0] and (not size or not store.strides[0]):
                 # Views of one value: join them as a view of it.
-                self._store[k] = np.broadcast_to(piece[:1], self._sizes[k]) if piece.size else store
+                if piece.size:
+                    self._store[k] = np.broadcast_to(piece[0], self._sizes[k])
                 continue
             n = self._sizes[k]
             if n > store.size or not store.flags.writeable:

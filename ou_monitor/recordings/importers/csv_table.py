@@ -23,13 +23,11 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
-    AMPERE_WORDS, CHANNEL, clock_times, factor_of, has_day, is_clock, is_missing, is_number,
-    is_value, number_of, OTHER_WORDS, SCALES, SHARE_WORDS, shown, TIME_WORDS, unit_of, unit_word,
-    VOLT_WORDS, WORDS)
+    AMPERE_WORDS, CHANNEL, clock_times, factor_of, FileColumn, has_day, in_si, is_clock,
+    is_missing, is_number, is_value, lower_rows, number_of, OTHER_WORDS, PULSE_WORDS, SCALES,
+    SHARE_WORDS, shown, stamps_of, TIME_WORDS, unit_of, unit_word, unwrapped, VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
-from ou_monitor.recordings.importers.csv_units import (
-    FileColumn, in_si, lower_rows, PULSE_WORDS, stamps_of, unwrapped)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, Request, Series)
 from ou_monitor.records import (
@@ -288,7 +286,8 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
                          'it had no sensor: name another column by --voltage-column')
     if logs.VOLTAGE in found and not series:
         _check_one_series(path, form, t, found[logs.VOLTAGE].name, volts, (*time.place, *places))
-    t, words = stamps_of(path, t, raw, wanted, clock)
+    t, words = stamps_of(path, t, clock, wanted.time_unit is not None,
+                         bool(clock.place) and holds_clocks(raw, clock.place[0]))
     even = spread(t, volts)
     if not np.array_equal(even, t, equal_nan=True):
         words += ', equal stamps spread evenly, a guess: --sample-interval'
