@@ -9,6 +9,7 @@ duplicates if all bytes of their data are equal; so a recompressed copy is not a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 import hashlib
 import os
@@ -95,7 +96,7 @@ def _real(path: Path) -> Path:
 
 def _candidates(root: Path, left_out: Path | None, closed: list[str]) -> Iterator[Path]:
     """Yield the files and bags in a folder; add the folders that cannot be read to `closed`."""
-    for folder, inner, names in _walk(root, lambda error: closed.append(
+    for folder, inner, names in os.walk(root, onerror=lambda error: closed.append(
             f"'{error.filename}' ({error.strerror})")):
         here = Path(folder)
         leave = here.resolve() == left_out
@@ -104,6 +105,10 @@ def _candidates(root: Path, left_out: Path | None, closed: list[str]) -> Iterato
             yield from () if leave else (here,)
             continue
         inner[:] = sorted(name for name in inner if not name.startswith('.'))
+        if inner and len(here.parts) - len(root.parts) >= _MOST_DEPTH:
+            # In Python 3.11, os.walk is recursive.
+            inner.clear()
+            closed.append(f"'{here}' (its content is more than {_MOST_DEPTH} folders deep)")
         yield from (here / name for name in sorted(names))
 
 
@@ -117,17 +122,6 @@ def _kind(path: Path) -> tuple[str, str] | None:
     if kind in _LOGS and kind_of(path) not in (BAG, CSV):
         return None
     return _LOG if kind in _LOGS and kind not in _COMMON else ('', '')
-
-
-def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
-          ) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield as os.walk does, but to a limited depth (in Python 3.11, os.walk is recursive)."""
-    for folder, inner, names in os.walk(root, onerror=onerror):
-        if folder.count(os.sep) - str(root).count(os.sep) >= _MOST_DEPTH and inner:
-            inner.clear()
-            if onerror is not None:
-                onerror(OSError(0, f'its content is more than {_MOST_DEPTH} folders deep', folder))
-        yield folder, inner, names
 
 
 def _is_bag(folder: Path) -> bool:
@@ -159,7 +153,8 @@ def _has_columns(path: Path) -> bool:
 def _source(path: Path) -> FoundRecording:
     files = [path]
     if os.path.isdir(path):
-        files = sorted(Path(folder) / name for folder, _, names in _walk(path) for name in names)
+        with suppress(OSError):
+            files = sorted(path.iterdir())
     size, stamps = 0, []
     for file in list(files):
         try:

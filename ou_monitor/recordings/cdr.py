@@ -4,7 +4,8 @@ Read fields of many CDR messages as arrays, by layouts that are learned from sin
 CDR has no fixed offsets, because the length of a text or a sequence shifts everything after it.
 But in a recording the same lengths recur. So one message is walked field by field, and its layout
 is used for all messages of the same size that state the same lengths. A message with a new layout
-is walked by itself; one that does not fit its type is refused.
+is walked by itself; one that does not fit its type is refused.  Texts are skipped, whatever they
+hold.
 
 Plain CDR version 1 (OMG DDS-XTypes 7.4.3): alignment is counted from after the 4-byte header.
 The fields come from the definition in a bag or from the message class.  Limits: a type with a
@@ -160,8 +161,6 @@ class Layout:
             raise ValueError('it is not plain CDR')
         # (offset, value) of every uint32 that states a length.
         self.words: list[tuple[int, int]] = []
-        # (offset, bytes) of every text, without its closing zero.
-        self.texts: list[tuple[int, int]] = []
         # Places of the wanted fields, except elements beyond the end of their array.
         self.places: dict[FieldPath, Place] = {}
         self._order = '<' if data[1] else '>'
@@ -179,12 +178,6 @@ class Layout:
             word: npt.NDArray[np.uint32] = np.ndarray(
                 rows.shape[:1], f'{self._order}u4', rows, offset, rows.strides[:1])
             same &= word == value
-        high = np.zeros(rows.shape[0], np.uint8)
-        for offset, size in self.texts:
-            # Loop over the bytes of the text, which are few, not over the messages.
-            for k in range(offset, offset + size):
-                high |= rows[:, k]
-        same &= high < 0x80
         return same
 
     def _message(self, kind: str, path: FieldPath, depth: int) -> None:
@@ -217,11 +210,7 @@ class Layout:
 
     def _one(self, kind: str, path: FieldPath, depth: int) -> None:
         if kind == TEXT:
-            length = self._word()
-            begin = self._take(length, 1)
-            if length > 1:
-                self._data[begin:begin + length - 1].decode()
-                self.texts.append((begin, length - 1))
+            self._take(self._word(), 1)
         elif kind in PRIMITIVES:
             self._numbers(kind, path)
         else:
@@ -509,8 +498,7 @@ class FieldReader:
                         refused[int(left[0])] = str(error)
                         left, rows = left[1:], rows[1:]
                         continue
-                    if (len(known) == MOST_LAYOUTS or len(layout.words) > _MOST_WORDS
-                            or not layout.holds_for(rows[:1])[0]):
+                    if len(known) == MOST_LAYOUTS or len(layout.words) > _MOST_WORDS:
                         yield left[:1], rows[:1], layout
                         left, rows = left[1:], rows[1:]
                         continue

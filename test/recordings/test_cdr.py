@@ -43,11 +43,13 @@ def numbers(raw):
 
 
 def one_by_one(spec, text, messages, table):
-    """Return stamps, counts and values as the library decodes them, or None where it refuses."""
+    """Return stamps, counts and values as the library decodes them; None or TEXTS: it refuses."""
     stamps, counts, values = [], [], [np.empty(0)]
     for message, logged in zip(messages, seconds(table.log_time)):
         try:
             decoded = decode(spec.type, message, text)
+        except UnicodeDecodeError:
+            return TEXTS
         except Exception:
             return None
         raw = walk(decoded, parse_field_path(spec.field), spec.field, spec.type)
@@ -105,6 +107,9 @@ def assert_both_ways(spec, text, messages, broken=False):
     table = table_of(messages)
     found = in_bulk(spec, text, table)
     expected = one_by_one(spec, text, messages, table)
+    if expected is TEXTS:
+        # Its text is no UTF-8: skipped here.
+        return
     if found is not None:
         assert_same(found, expected)
     elif expected is not None and not broken:
@@ -278,7 +283,7 @@ def test_stamps_and_their_absence(stamp, counts):
 
 
 def test_big_endian_is_read_and_bad_messages_are_left_out():
-    """XCDR2, invalid text and truncated messages are left out with a reason, in order."""
+    """XCDR2 and truncated messages are left out with a reason, in order; texts are skipped."""
     good = cdr.encode_scalars(cdr.FLOAT32, [1.0, 2.0, 4.0])
     big = b'\0\0\0\0' + np.array([8.0], '>f4').tobytes()
     xcdr2 = b'\0\x07' + good[0][2:]
@@ -290,7 +295,7 @@ def test_big_endian_is_read_and_bad_messages_are_left_out():
     assert broken == [(2, 'it is not plain CDR'),
                       (4, 'it is shorter than its own lengths state'), (5, 'it is not plain CDR')]
     odd = battery('base', 5.0).replace(b'base', b'\xffase')
-    assert "codec can't decode" in read_all(BATTERY, [odd])[1][0][1]
+    assert read_all(BATTERY, [odd])[0].values.tolist() == [5.0]
 
 
 @pytest.mark.parametrize('labels', [[], ['a'], ['rows', 'columns'], ['x' * 7, 'y' * 8]])
