@@ -193,8 +193,6 @@ class McapFile:
         words = f'at byte {first}: {why} (' + (
             'before the first message' if newest is None else
             moment(newest, self.origin_ns)) + ')'
-        if rest + 1 >= _MOST_BREAKS:
-            return f'{words}; and at {rest} more places, after which the search ended'
         return words + (f'; and at {counted(rest, "more place")}, the last at byte '
                         f'{self.breaks[-1][0]}' if rest else '')
 

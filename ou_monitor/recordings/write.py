@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import heapq
+from itertools import repeat
 import math
 from pathlib import Path
 
@@ -103,7 +104,7 @@ def write_recording(
                 whole = stamps.size - stamps.size % BLOCK
                 rest = stamps[whole:], volts[whole:]
             count += piece.n
-            streams = [_timed(VOLTAGE, encode(kind, stamps[:whole], volts[:whole]))]
+            streams = [_encoded(VOLTAGE, kind, stamps[:whole], volts[:whole])]
             for k, name in enumerate(LOADS):
                 load = getattr(piece, name)
                 known = np.isfinite(load) if load is not None else np.zeros(piece.n, np.bool_)
@@ -117,10 +118,10 @@ def write_recording(
                 sent = (np.diff(values, prepend=np.float32(held[name][0])) != 0.0) | (
                     np.diff(periods, prepend=held[name][1]) > 0)
                 held[name] = float(values[-1]), int(periods[-1])
-                streams.append(_timed(k, encode(FLOAT32, at[sent], values[sent])))
+                streams.append(_encoded(k, FLOAT32, at[sent], values[sent]))
             for t, topic, data in heapq.merge(*streams):
                 bag.write(f"/{(*LOADS, 'voltage')[topic]}", t, data)
-        for t, data in encode(kind, *rest):
+        for t, _, data in _encoded(VOLTAGE, kind, *rest):
             bag.write('/voltage', t, data)
     return bag.topics, notes
 
@@ -133,10 +134,6 @@ def _pieces(rec: Recording | Iterable[Recording]) -> Iterator[Recording]:
         part = slice(first, first + SLICE)
         yield Recording(rec.t[part], rec.voltage[part], rec.throttle[part], rec.name,
                         current=None if rec.current is None else rec.current[part])
-
-
-def _timed(topic: int, messages: Iterable[tuple[int, bytes]]) -> Iterator[Timed]:
-    return ((t, topic, data) for t, data in messages)
 
 
 def _moved(shift: int) -> tuple[str, ...]:
@@ -207,21 +204,21 @@ def _messages(place: int, kind: str, stamps: Stamps, one: Series) -> Iterator[Ti
     motors = one.name.split(', ')
     for first in range(0, stamps.size, SLICE):
         part = slice(first, first + SLICE)
-        yield from _timed(place, encode(kind, stamps[part], one.values[part], motors))
+        yield from _encoded(place, kind, stamps[part], one.values[part], motors)
 
 
-def encode(kind: str, stamps: Stamps, values: FloatArray, motors: Sequence[str] = (),
-           ) -> Iterator[tuple[int, bytes]]:
-    """Yield messages with their log times, ns (of a block: of its last sample)."""
+def _encoded(topic: int, kind: str, stamps: Stamps, values: FloatArray,
+             motors: Sequence[str] = ()) -> Iterator[Timed]:
+    """Yield messages with their log times (of a block: of its last sample)."""
     if kind == FLOAT32_ARRAY:
         whole = stamps.size - stamps.size % BLOCK
-        yield from zip(stamps[BLOCK - 1:whole:BLOCK].tolist(),
-                       encode_blocks(values[:whole].reshape(-1, BLOCK)), strict=True)
+        yield from zip(stamps[BLOCK - 1:whole:BLOCK].tolist(), repeat(topic),
+                       encode_blocks(values[:whole].reshape(-1, BLOCK)))
         if whole < stamps.size:
-            yield int(stamps[-1]), encode_blocks(values[None, whole:])[0]
+            yield int(stamps[-1]), topic, encode_blocks(values[None, whole:])[0]
         return
-    yield from zip(stamps.tolist(), (
+    yield from zip(stamps.tolist(), repeat(topic), (
         encode_battery(stamps, values) if kind == BATTERY_STATE else
         encode_imu(stamps, values) if kind == IMU else
         encode_joints(stamps, motors, values) if kind == JOINT_STATE else
-        encode_scalars(kind, values)), strict=True)
+        encode_scalars(kind, values)))

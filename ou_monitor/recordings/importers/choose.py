@@ -191,10 +191,8 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
 
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
-# Number of parts of a series whose rates are compared; ratio of rates above which a note is given.
-_PARTS, _UNEQUAL = 10, 1.5
-# Minimum length of a gap, in median steps.
-_GAP = 3.0
+# Minimum length of a gap, in median steps; minimum number of stamps for the median.
+_GAP, _LEAST = 3.0, 40
 
 
 def choose_extras(path: Path, log: Log, *, imu: str | None = None, signals: Sequence[str] = (),
@@ -205,7 +203,7 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None, signals: Sequ
     gyro = _gyro(path, log, imu)
     if gyro is not None:
         gyro, said = clean(gyro)
-        notes += prefixed(gyro.name, (*said, *pace_notes(gyro.t)))
+        notes += prefixed(gyro.name, (*said, *gap_notes(gyro.t)))
         if gyro.n:
             found[IMU] = gyro
         else:
@@ -249,7 +247,7 @@ def signal_of(path: Path, log: Log, name: str) -> tuple[Series, tuple[str, ...]]
     if not series.n:
         raise InputError(f'{path}: {name} has no usable sample'
                          + ''.join(f' ({sentence})' for sentence in said))
-    return series, tuple(prefixed(name, (*said, *pace_notes(series.t))))
+    return series, tuple(prefixed(name, (*said, *gap_notes(series.t))))
 
 
 def topic_of(name: str) -> str:
@@ -281,20 +279,9 @@ def _gyro(path: Path, log: Log, name: str | None) -> Series | None:
     return log.inertial[known.index(name)]
 
 
-def pace_notes(t: FloatArray) -> tuple[str, ...]:
-    """Return notes on pauses of the stamps, and on changes of their rate (t in s)."""
-    if t.size < 4 * _PARTS:
-        return ()
+def gap_notes(t: FloatArray) -> tuple[str, ...]:
+    """Return a note on pauses of the stamps, s, if there are any."""
     steps = np.diff(t)
-    usual = float(np.median(steps))
-    notes: list[str] = []
-    gaps = steps > _GAP * usual
-    if gaps.any():
-        count = int(gaps.sum())
-        notes.append(Note(f'{counted(count, "gap")} of up to {float(steps.max()):.3g} s.',
-                          Defect.GAPS))
-    paces = [float(np.median(part)) for part in np.array_split(steps, _PARTS)]
-    if max(paces) > _UNEQUAL * min(paces):
-        notes.append(f'The rate changes between {1.0 / max(paces):.4g} and '
-                     f'{1.0 / min(paces):.4g} Hz.')
-    return tuple(notes)
+    if t.size < _LEAST or not (gaps := int((steps > _GAP * np.median(steps)).sum())):
+        return ()
+    return (Note(f'{counted(gaps, "gap")} of up to {float(steps.max()):.3g} s.', Defect.GAPS),)
