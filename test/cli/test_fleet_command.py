@@ -1,5 +1,6 @@
 """`ou-monitor fleet` for users: complete, with bad files, killed, interrupted, resumed."""
 
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -48,8 +49,8 @@ def logs(tmp_path_factory) -> Path:
         (folder / vehicle).mkdir()
         for number in range(1, FLIGHTS + 1):
             write(folder / vehicle / f'flight_{number}.csv', flight(100 * k + number))
-    write_recording(flight(7), folder / 'uav2' / 'bag_9', type='float32',
-                    start_ns=1_700_000_000_000_000_000)
+    dated = flight(7)
+    write_recording(replace(dated, t=1.7e9 + dated.t), folder / 'uav2' / 'bag_9', type='float32')
     (folder / 'uav1' / 'bad.mcap').write_text('this is no bag')
     (folder / 'uav1' / 'tuning.csv').write_text('gain,value\n1,2\n')
     (folder / 'uav1' / 'raw.ulg').write_bytes(b'ULog')

@@ -1,7 +1,5 @@
 """ArduPilot dataflash: series, scales, and truncated or damaged logs."""
 
-import struct
-
 from made_logs import copter, Dataflash, load, named, outcomes_of_flipped_bytes
 import numpy as np
 from ou_monitor.errors import InputError
@@ -146,15 +144,6 @@ def test_a_text_log_cut_off(tmp_path):
         'Left out: 1 line not in any format of this log.',
         f'The last line does not end: the log was cut off at byte {len(text) - 7}.')
     assert choose(path, log).voltage.n == 30
-
-
-def test_sizes_of_the_writer():
-    """The made log is what the format says: 89 bytes for a format, 3 of head for a message."""
-    made = copter(2)[0]
-    assert len(made.pieces[0]) == 89
-    number, layout, _ = made.known['BAT']
-    piece = next(p for p in made.pieces if p[2] == number and p[:2] == b'\xa3\x95')
-    assert len(piece) == 3 + struct.calcsize(layout)
 
 
 @pytest.mark.parametrize('kind, columns, name', [

@@ -12,26 +12,6 @@ from ou_monitor.recordings.importers.log import Request
 import pytest
 
 
-def test_battery_and_motors_are_read_exactly(tmp_path):
-    """Battery and motors are read bit for bit, with stamps counted from the header's."""
-    topics, t, volts, motors, amperes = px4_flight()
-    path, log = load(tmp_path, ulog(topics, start_us=4_000_000, info={
-        'sys_name': 'PX4', 'ver_sw_branch': 'main', 'ver_hw': 'BOARD_7'}))
-    chosen = choose(path, log)
-    assert log.facts == {'firmware': 'PX4 main', 'board': 'BOARD_7'}
-    assert log.notes == ()
-    assert chosen.voltage.name == 'battery_status[0].voltage_v'
-    assert chosen.current.name == 'battery_status[0].current_a'
-    assert chosen.throttle.name == 'actuator_motors[0]'
-    np.testing.assert_array_equal(chosen.voltage.values, volts.astype(float))
-    np.testing.assert_array_equal(chosen.current.values, amperes.astype(float))
-    np.testing.assert_allclose(chosen.throttle.values, motors, rtol=1e-12)
-    np.testing.assert_allclose(chosen.voltage.t, (t - 4_000_000) * 1e-6, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(chosen.throttle.t, (t - 3_999_000) * 1e-6, rtol=0, atol=1e-9)
-    # The rail behind a regulator is named, not taken.
-    assert any('system_power[0].voltage5v_v (5 V rail)' in note for note in chosen.notes)
-
-
 @pytest.mark.parametrize('uuid, fact', [
     ('00060038', {'vehicle': 'BOARD_7 00060038'}), ('00000000', {'board': 'BOARD_7'})])
 def test_a_vehicle_has_a_number_of_its_own(tmp_path, uuid, fact):
