@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from mcap.writer import CompressionType, Writer
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    Definitions, ColumnBuffer, FieldColumn, FieldReader, MessageTable)
+    ColumnBuffer, Definitions, FieldColumn, FieldReader, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
