@@ -107,6 +107,15 @@ def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, str], s
     return files, {}, missing
 
 
+def remove_bag(files: Iterable[Path], folder: Path | None) -> None:
+    """Remove files and metadata of a bag, and its folder if it is then empty."""
+    for file in (*files, *(() if folder is None else [folder / FILE])):
+        file.unlink(missing_ok=True)
+    if folder is not None:
+        with suppress(OSError):
+            folder.rmdir()
+
+
 class RawMessage(NamedTuple):
     """One message as recorded; `data` is CDR, `log_time_ns` in ns."""
 
@@ -425,11 +434,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         # On a full disk closing fails too, because the buffer cannot be flushed.
         with suppress(OSError):
             self._file.close()
-        self._mcap.unlink(missing_ok=True)
-        if self._folder is not None:
-            (self._folder / FILE).unlink(missing_ok=True)
-            with suppress(OSError):
-                self._folder.rmdir()
+        remove_bag([self._mcap], self._folder)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None,
