@@ -102,9 +102,9 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
 
 
 def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float | None = None,
-            noise_std: float = 0.0, *, coarse: bool = False) -> FloatArray:
+            noise_std: float = 0.0) -> FloatArray:
     """Return P(the continuous path goes below `voltage`, V, of any shape, within `horizon`, s)."""
-    return _Paths(supply, now, noise_std, *(_FEW if coarse else _MANY)).risk(voltage, horizon)
+    return _Paths(supply, now, noise_std, *_MANY).risk(voltage, horizon)
 
 
 class _Paths:

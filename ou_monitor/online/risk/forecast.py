@@ -85,7 +85,9 @@ def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     angle = np.arctan2(math.sqrt(FREEDOM), np.abs(t))
     c = np.sin(angle)
     tail = (angle - np.cos(angle) * c * (1.0 + 2.0 / 3.0 * c * c)) / math.pi
-    tail = np.where(c < 0.2, c**5 * np.polyval(_TAIL, c * c), tail)
+    far = c < 0.2
+    if far.any():
+        tail = np.where(far, c**5 * np.polyval(_TAIL, c * c), tail)
     return np.asarray(np.where(t < 0.0, tail, 1.0 - tail))
 
 
