@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output '{folder}' is a file: name a folder")
     from ou_monitor.fleet.find import find_recordings
-    from ou_monitor.fleet.fleet import is_own, run_fleet
+    from ou_monitor.fleet.fleet import run_fleet
     from ou_monitor.fleet.vehicles import read_pattern
 
     made = {f'--output ({name})': folder / name for name in (REPORT, TABLE)}
@@ -42,11 +42,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"'{path}' is not a file: remove it, or name another folder")
     output.check_paths({}, {**made, '--json': args.json}, force=True)
     output.check_paths({}, {'--json': args.json}, args.force)
-    if not (args.force or is_own(folder)):
-        for path in made.values():
-            if os.path.lexists(path):
-                raise InputError(f"'{path}' was not written by fleet: --force overwrites it, or "
-                                 'name another folder')
+    _check_own(folder, args.force)
     output.check_writable(args.json)
 
     options = _options(args)
@@ -69,6 +65,20 @@ def run(args: argparse.Namespace) -> int:
         raise InputError('none of the recordings could be analysed; the reasons are in '
                          f"'{folder}' and in the column error of the table")
     return 0
+
+
+def _check_own(folder: Path, force: bool) -> None:
+    """Refuse to replace a table or report that no earlier run wrote, except with --force."""
+    from ou_monitor.fleet.fleet import is_own
+    from ou_monitor.fleet.table import is_table
+    from ou_monitor.report.fleet_document import TITLE
+    from ou_monitor.report.page import is_page
+
+    for path in (folder / REPORT, folder / TABLE):
+        if not force and os.path.lexists(path) and not (is_own(folder) and (
+                is_table(path) if path.name == TABLE else is_page(path, TITLE))):
+            raise InputError(f"'{path}' was not written by fleet, or was changed since: --force "
+                             'overwrites it, or name another folder')
 
 
 def _check_installed(args: argparse.Namespace) -> None:
@@ -97,6 +107,8 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     from ou_monitor.report.fleet_document import as_data, fleet_document
     from ou_monitor.report.result import Result
 
+    # Again, because the run may have taken hours.
+    _check_own(folder, args.force)
     write_table(fleet.rows, folder / TABLE)
     found = Result(fleet, lambda: fleet_document(fleet), lambda: as_data(fleet), 'rows')
     output.deliver(args, found, table=folder / TABLE, report=folder / REPORT)

@@ -13,7 +13,7 @@ from typing import Any
 
 from ou_monitor.fleet.find import FoundRecording
 from ou_monitor.fleet.vehicles import Vehicle
-from ou_monitor.stream.files import write_whole
+from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
 
 Row = dict[str, Any]
@@ -144,6 +144,20 @@ def _as_text(value: Any) -> Any:
     if isinstance(value, dict):
         return json.dumps(value, allow_nan=False)
     return [_as_text(item) for item in value] if isinstance(value, list) else value
+
+
+def is_table(path: Path) -> bool:
+    """Return whether `write_table` wrote a file, in this version or an earlier one."""
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        with open_regular(path) as file:
+            fields = parquet.read_schema(file)
+    except (OSError, pyarrow.ArrowException):
+        return False
+    return fields.names[:2] == [*NAMES[:2]] and all(
+        b'meaning' in (field.metadata or {}) for field in fields)
 
 
 def write_table(rows: Sequence[Row], path: Path) -> None:

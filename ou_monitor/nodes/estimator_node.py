@@ -72,6 +72,7 @@ class EstimatorNode(MonitorNode):
         super().__init__(name, managed=managed)
 
     def start(self) -> None:
+        """Begin without data, except for a latched flag."""
         sys.setswitchinterval(SWITCH)
         values = self.values()
         settings = _settings(values)
@@ -85,9 +86,9 @@ class EstimatorNode(MonitorNode):
         self._watched = PublisherWatch(self)
         self._settled = 0
         self._console = Console(self)
-        # Time at which the next estimate is due, s; CPU time of pushing samples, s, and since when
-        # it is counted.
-        self._due = -math.inf
+        # Times, s, at which the next estimate is due, and at which outputs and diagnostics were
+        # last published; below: CPU time of pushing samples, s, and since when it is counted.
+        self._due = self._published = self._diagnosed = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
         self._handed_over = -math.inf
         self._throttle_silence = Silence(self.steady_now)
@@ -129,7 +130,20 @@ class EstimatorNode(MonitorNode):
             self._monitor.restart(error)
 
     def check(self, values: Mapping[str, Any]) -> None:
-        self._models.check(_settings(values).model_file)
+        """Raise `ValueError` when the parameters contradict each other."""
+        path = _settings(values).model_file
+        self._models.check(path, self._keep_working)
+
+    def _keep_working(self) -> None:
+        """Do the work of the timers while a callback waits for a file."""
+        if not self.running:
+            return
+        now = self.steady_now()
+        self._poll()
+        if now - self._published >= 1.0 / self.values()[PUBLISH_RATE.name]:
+            self._publish(*self._report())
+        if now - self._diagnosed >= 1.0:
+            self._diagnose()
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Apply checked parameters; no sample in the window is lost."""
@@ -141,6 +155,7 @@ class EstimatorNode(MonitorNode):
     # -- sources of the input
 
     def _watch(self) -> None:
+        """Check the publishers, 5 times a second."""
         self._stamper.follow()
         self._watched.look(self._inputs.get('voltage'))
         if self._arrived.age is None and not self._sources.problems['voltage']:
@@ -279,7 +294,8 @@ class EstimatorNode(MonitorNode):
                   'noise_v': learned.noise}
         path = self._models.save(learned, {
             'date': time.strftime('%Y-%m-%d', time.gmtime()),
-            **{name: value if value > 0.0 else None for name, value in values.items()}})
+            **{name: value if value > 0.0 else None for name, value in values.items()}},
+            self._keep_working)
         self._monitor.set_model(self._models.use(path))
         return f'{path}: saved the load model of this flight; unchanged: {self._models.terms}.'
 
@@ -328,6 +344,7 @@ class EstimatorNode(MonitorNode):
         return report, level, summary
 
     def _notes(self) -> list[str]:
+        """Return the notes that are added to any summary."""
         notes = []
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples enters the estimate; all '
@@ -338,6 +355,7 @@ class EstimatorNode(MonitorNode):
         return notes
 
     def _why_unusable(self) -> str:
+        """Return why arriving messages contain no usable voltage."""
         if self._stamper.waiting and self._stream.unplaced:
             return f'Messages without a stamp cannot be placed in time: {NO_CLOCK}'
         spec = self._voltage.spec
@@ -346,6 +364,7 @@ class EstimatorNode(MonitorNode):
 
     @property
     def _voltage(self) -> Source:
+        """Return the source of the voltage, opened or awaited."""
         return self._sources.opened.get('voltage', self._sources.sources['voltage'])
 
     @property
@@ -354,6 +373,7 @@ class EstimatorNode(MonitorNode):
 
     def _publish(self, report: MonitorReport, level: Level, summary: str) -> None:
         """Publish a report on every topic but the diagnostics."""
+        self._published = self.steady_now()
         values = {'alpha': report.estimate.alpha, 'sigma': report.estimate.sigma,
                   'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
                   'throttle_budget': report.budget}
@@ -365,6 +385,7 @@ class EstimatorNode(MonitorNode):
         self._state.publish(self._message('state', report, level, summary, report.estimate.t))
 
     def _diagnose(self) -> None:
+        self._diagnosed = self.steady_now()
         found = self._report()
         if found[0].flag.low:
             # Without a hold, a dip is in only one report, so publish this one.
@@ -390,4 +411,5 @@ class EstimatorNode(MonitorNode):
 
 
 def _settings(values: Mapping[str, Any]) -> MonitorSettings:
+    """Return the settings of the monitor; the other parameters are the node's."""
     return monitor_settings({p.name: values[p.name] for p in ESTIMATOR_PARAMETERS})

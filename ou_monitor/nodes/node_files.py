@@ -9,8 +9,8 @@ if it is a regular file that names this node.  This module does not import ROS.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as NotReadyError
 from contextlib import contextmanager
 from dataclasses import replace
 import fcntl
@@ -21,7 +21,7 @@ from pathlib import Path
 import stat
 import tempfile
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from ou_monitor.errors import InputError
 from ou_monitor.stream.files import open_regular, path_words
@@ -31,27 +31,48 @@ if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
     from ou_monitor.recordings.model_file import ModelFile
 
-# Maximum number of flights in the history of a model file (together 30 kB), and maximum size of
-# the file, bytes.  The node waits while a file is read: usually 10 ms, the largest takes 1 s.
-_HISTORY, _LARGEST = 200, 200_000
+T = TypeVar('T')
+
+# Timeout of reading or writing a file, s: most files take 10 ms, the largest allowed take 5 s.
+PATIENCE = 20.0
+# Period at which `meanwhile` is called while a file is read or written, s.
+PAUSE = 0.02
+# Maximum number of flights in the history of a model file; maximum size of the file, bytes.
+_HISTORY, _LARGEST = 200, 2_000_000
 
 
 class ModelChoice:
-    """The model in use, from the parameter `model_file`."""
+    """The model in use, from the parameter `model_file`; a thread reads and writes files."""
 
     def __init__(self) -> None:
         self._used: _Chosen = '', None, b''
         self._checked: _Chosen = '', None, b''
+        self._reader = ThreadPoolExecutor(1, 'model_file')
 
-    def check(self, path: str) -> None:
+    def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
         """Read a model file that is not yet in use; raise `ValueError` if it is unusable."""
         if not path or path == self._used[0]:
             self._checked = self._used if path else ('', None, b'')
             return
         try:
-            self._checked = path, *_read(path)
+            self._checked = path, *self._wait(self._reader.submit(_read, path), meanwhile)
+        except NotReadyError as error:
+            raise ValueError(f'model_file: {path_words(path)} was not read within '
+                             f'{PATIENCE:g} s') from error
         except InputError as error:
             raise ValueError(f'model_file: {error}') from error
+
+    def _wait(self, future: Future[T], meanwhile: Callable[[], object]) -> T:
+        """Return the result, calling `meanwhile` every `PAUSE`; NotReadyError after `PATIENCE`."""
+        until = time.monotonic() + PATIENCE
+        while True:
+            try:
+                return future.result(PAUSE)
+            except NotReadyError:
+                if time.monotonic() > until:
+                    future.cancel()
+                    raise
+                meanwhile()
 
     def use(self, path: str) -> SupplyModel | None:
         """Use the file of a path, which must be the one checked last; return its model."""
@@ -67,7 +88,8 @@ class ModelChoice:
         file = self._used[1]
         return '' if file is None else ','.join(term.NAME for term in file.model.terms)
 
-    def save(self, load: LoadStart, entry: Mapping[str, object]) -> str:
+    def save(self, load: LoadStart, entry: Mapping[str, object],
+             meanwhile: Callable[[], object] = lambda: None) -> str:
         """Write a learned load, and an entry of the history, into the file; return its path."""
         path, file, known = self._used
         if file is None:
@@ -77,10 +99,14 @@ class ModelChoice:
         file = replace(file, model=replace(file.model, load=load, date=str(entry['date'])),
                        provenance={**file.provenance, 'date': entry['date'], 'history': history})
         try:
-            self._used = path, file, _save(path, file, known)
+            written = self._wait(self._reader.submit(_save, path, file, known), meanwhile)
         except (OSError, ValueError) as error:
             raise InputError(f'model_file {path_words(path)} was not changed: '
                              f'{_words(error)}.') from error
+        except NotReadyError as error:
+            raise InputError(f'model_file {path_words(path)} was not written within '
+                             f'{PATIENCE:g} s.') from error
+        self._used = path, file, written
         return path
 
 
@@ -89,15 +115,15 @@ _Chosen = tuple[str, 'ModelFile | None', bytes]
 
 
 def _read(path: str) -> tuple[ModelFile, bytes]:
+    """Return a parsed model file, and its bytes."""
     try:
+        # Read the file before the slow import below (a second on a busy machine), so that errors
+        # are reported at once.
         with open_regular(path) as file:
-            known = file.read(_LARGEST + 1)
+            known = file.read(_LARGEST)
     except (OSError, ValueError) as error:
         why = (error.strerror if isinstance(error, OSError) else None) or 'it is not a path'
         raise InputError(f'cannot read the model file {path_words(path)}: {why}') from error
-    if len(known) > _LARGEST:
-        raise InputError(f'{path_words(path)} is larger than {_LARGEST} bytes, so it is no model '
-                         'file')
     from ou_monitor.recordings.model_file import read_model
     return read_model(path), known
 
@@ -284,14 +310,21 @@ class LatchFile:
 
     def _replace(self, text: bytes) -> None:
         """Write a new file, sync, read back and lock it, and rename it over the old one."""
-        self._claim()
+        exists = self._claim() is not None
         # Readable by everyone, like an ordinary file.
         with _draft(self.path, text, 0o644) as (handle, beside):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not exists:
+                # Fails if a file has appeared meanwhile.  (`os.link` would fail too, but FAT has
+                # no links.)
+                os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
             os.rename(beside, self.path)
             self._keep_lock(handle)
+        if not os.path.samestat(os.lstat(self.path), os.fstat(handle)):
+            raise ValueError('another file has taken its place')
 
     def _keep_lock(self, handle: int | None) -> None:
+        """Keep the handle that has the lock; close the previous one."""
         old, self._lock = self._lock, handle
         if old is not None:
             os.close(old)

@@ -36,6 +36,7 @@ _RECORDINGS = 500
 _ONE_PACK = 1.6
 # Maximum ageing packs named in the answer.
 _OLD = 3
+TITLE = 'Supply noise of a fleet'
 # Heads of the tables of packs and of vehicles.
 PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\nper cell, mOhm',
               'per flight\n[95 %]', 'sag\nper cell, mV', 'per flight\n[95 %]')
@@ -81,7 +82,7 @@ def fleet_document(fleet: Fleet) -> Document:
         Section('What to know before using these numbers', [
             Notes.of([*fleet.notes, *comparison_words(fleet)])]),
         lambda: [Section('Recordings', _recordings(fleet), folded=True)]]
-    return Document('Supply noise of a fleet', subject, answer(fleet), parts)
+    return Document(TITLE, subject, answer(fleet), parts)
 
 
 def answer(fleet: Fleet) -> list[str]:

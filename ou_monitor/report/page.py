@@ -21,6 +21,7 @@ from html import escape
 from importlib import resources
 import json
 import math
+from pathlib import Path
 import re
 from typing import Any
 import zlib
@@ -30,6 +31,7 @@ from ou_monitor.records import FloatArray, plain_data, Severity
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Curve, extremes, Plot
+from ou_monitor.stream.files import open_regular
 
 # Maximum points of a plot that is embedded in full, which then takes up to 1.6 MB.
 MOST = 150_000
@@ -130,6 +132,10 @@ def _column(values: FloatArray, block: bytearray) -> list[int]:
 _DASH = '\u2013'
 
 
+# How each page begins and ends.
+_BEGIN, _END = '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>', '</body></html>\n'
+
+
 @cache
 def _file(name: str) -> str:
     return resources.files(__package__).joinpath(name).read_text(encoding='utf-8')
@@ -182,11 +188,22 @@ def html(document: Document, command: str = '') -> str:
               "base-uri 'none'; form-action 'none'")
     style = _file('page.css') + (_file('plots.css') if text else '')
     script = f'<script>{text}</script>\n' if text else ''
-    return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>\n'
+    return (f'{_BEGIN}\n'
             f'<meta http-equiv="Content-Security-Policy" content="{policy}"/>\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1"/>\n'
             f'<title>{escape(document.title)}</title>\n<style>\n{style}</style></head>\n'
-            f'<body>\n{_top(document)}{body}\n{script}</body></html>\n')
+            f'<body>\n{_top(document)}{body}\n{script}{_END}')
+
+
+def is_page(path: Path, title: str) -> bool:
+    """Return whether a file begins and ends as the page of a document with this title."""
+    try:
+        with open_regular(path) as file:
+            page = file.read()
+    except OSError:
+        return False
+    return page.startswith(_BEGIN.encode()) and page.endswith(_END.encode()) and (
+        f'<title>{escape(title)}</title>'.encode() in page[:1000])
 
 
 def section(document: Document) -> str:

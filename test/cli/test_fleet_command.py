@@ -14,6 +14,7 @@ import time
 from command_line import failure, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
+from ou_monitor.fleet.fleet import run_fleet
 from ou_monitor.fleet.table import COLUMNS, NAMES
 from ou_monitor.model.ou import simulate
 from ou_monitor.recordings.write import write_recording
@@ -341,6 +342,35 @@ def test_files_in_a_folder_of_that_shape_are_not_its_own(name, tmp_path, one_pro
     if not name.startswith('parts'):
         assert main([*given, '--force']) == main(given) == 0
         assert (out / name).read_bytes() != b'precious'
+
+
+@pytest.mark.parametrize('name', ['fleet.html', 'fleet.parquet'])
+def test_an_output_is_replaced_only_if_its_content_is_of_fleet(name, tmp_path, one_process,
+                                                               capsys, monkeypatch):
+    """Before the work and before the write; --force replaces any."""
+    out = tmp_path / 'out'
+    again = ['fleet', str(write(tmp_path / 'a.csv', flight(1, n=3000))), '--output', str(out)]
+    assert main(again) == 0 and main(again) == 0
+    made = {path.name: path.read_bytes() for path in out.glob('fleet.*')}
+    table = pyarrow.table({'vehicle': ['mine'], 'vehicle_from': ['mine']})
+    parquet.write_table(table, tmp_path / 'other.parquet')
+    for content in (b'mine', b'', b'PAR1minePAR1', (tmp_path / 'other.parquet').read_bytes(),
+                    b'<!DOCTYPE html>\n<title>Supply noise of a fleet</title></body></html>\n',
+                    made[name] + b'my remark'):
+        (out / name).write_bytes(content)
+        capsys.readouterr()
+        assert f"{name}' was not written by fleet" in refused(capsys, *again[1:])
+        assert {p.name: p.read_bytes() for p in out.glob('fleet.*')} == {**made, name: content}
+    assert main([*again, '--force']) == 0 and (out / name).read_bytes() != content
+    capsys.readouterr()
+
+    def meanwhile(*given, **options):
+        (out / name).write_bytes(b'mine')
+        return run_fleet(*given, **options)
+    monkeypatch.setattr('ou_monitor.fleet.fleet.run_fleet', meanwhile)
+    others = {p.name: p.read_bytes() for p in out.glob('fleet.*') if p.name != name}
+    assert f"{name}' was not written by fleet" in refused(capsys, *again[1:])
+    assert {p.name: p.read_bytes() for p in out.glob('fleet.*')} == {**others, name: b'mine'}
 
 
 def test_a_fleet_of_bad_files_alone_is_refused(tmp_path, one_process, capsys):

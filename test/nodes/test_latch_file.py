@@ -1,85 +1,15 @@
-"""The files of a node: model and latch are kept or refused, and no other file is touched."""
+"""The latch on disk: kept, cleared, retried, and no other file is touched."""
 
-from dataclasses import replace
 import errno
 import json
 import os
 import stat
 import threading
 
-from live import ROOT, wait_until
-from ou_monitor.errors import InputError
+from live import wait_until
 from ou_monitor.nodes import node_files
-from ou_monitor.nodes.node_files import LatchFile, ModelChoice
-from ou_monitor.recordings.model_file import read_model
+from ou_monitor.nodes.node_files import LatchFile
 import pytest
-
-
-def test_a_model_file_that_is_no_file_is_refused(tmp_path):
-    """At once, in one line; nothing is loaded for it."""
-    choice = ModelChoice()
-    fifo = tmp_path / 'fifo'
-    os.mkfifo(fifo)
-    for path in (str(fifo), '/dev/zero', str(tmp_path), '/no/such.yaml', 'a\0b'):
-        with pytest.raises(ValueError, match='model_file: cannot read the model file') as caught:
-            choice.check(path)
-        assert '\n' not in str(caught.value)
-
-
-def test_a_refused_file_leaves_the_model_in_use(tmp_path):
-    """Good or refused, it is known when the answer is given."""
-    path, bad, large = (tmp_path / name for name in ('model.yaml', 'bad.yaml', 'large.yaml'))
-    path.write_text((ROOT / 'models' / 'gecko.yaml').read_text())
-    bad.write_text('terms: []')
-    large.write_text('#' * 200_001)
-    choice = ModelChoice()
-    choice.check(str(path))
-    model = choice.use(str(path))
-    assert choice.terms.startswith('ou,')
-    for other, words in ((bad, 'bad.yaml'), (large, 'larger than')):
-        with pytest.raises(ValueError, match=f'model_file: .*{words}'):
-            choice.check(str(other))
-        assert choice.use(str(path)) is model
-    choice.check('')
-    assert choice.use('') is None and choice.terms == ''
-
-
-def test_a_flight_is_saved_into_its_own_file_alone(tmp_path):
-    """In place, head, mode and terms kept, with a history; never over what was not read."""
-    path = tmp_path / 'model.yaml'
-    path.write_text((ROOT / 'models' / 'gecko.yaml').read_text())
-    path.chmod(0o640)
-    choice = ModelChoice()
-    with pytest.raises(InputError, match='no model_file in use'):
-        choice.save(None, {})
-    choice.check(str(path))
-    model = choice.use(str(path))
-    for k in range(2):
-        load = replace(model.load, volts=14.0 + k)
-        assert choice.save(load, {'date': f'2026-08-0{k + 1}', 'sag_ratio': 1.1}) == str(path)
-        assert choice.use(str(path)).load == load
-        assert choice.use(str(path)).date == f'2026-08-0{k + 1}'
-    written = read_model(path)
-    assert written.model == replace(model, load=load) and written.model.date == '2026-08-02'
-    assert [entry['date'] for entry in written.provenance['history']] == [
-        '2026-08-01', '2026-08-02']
-    assert written.provenance['recording'] == 'gecko.csv'
-    assert path.read_text().startswith('# Learned by') and stat.S_IMODE(
-        path.stat().st_mode) == 0o640
-    other = tmp_path / 'other.yaml'
-    changed = path.read_text() + '# by hand'
-    path.write_text(changed)
-    for change, words in (
-            (lambda: None, 'has changed'),
-            (lambda: (path.rename(other), path.symlink_to(other)), 'symbolic link'),
-            (lambda: (path.unlink(), os.mkfifo(path)), 'not a regular file'),
-            (path.unlink, 'No such file')):
-        change()
-        with pytest.raises(InputError, match=f'was not changed: .*{words}'):
-            choice.save(load, {'date': '2026-08-03'})
-        assert choice.use(str(path)).date == '2026-08-02'
-    assert other.read_text() == changed and os.listdir(tmp_path) == ['other.yaml']
-
 
 GOOD = {'node': '/n', 'level': 'CRITICAL', 'reason': 'low', 'time': 1.7e9}
 
