@@ -182,7 +182,7 @@ def test_filter_numbers_are_those_of_the_laws():
     """Noise taken off between 150 and 20 Hz, and lags."""
     import math
 
-    from ou_monitor.online.filter.cutoff_laws import supply_noise
+    from ou_monitor.online.filter.cutoff import supply_noise
     from ou_monitor.online.filter.filter_state import cutoff_for_lag
     off = {mode: 1.0 - math.sqrt(supply_noise(mode, 2, 20.0, 63.0)
                                  / supply_noise(mode, 2, 150.0, 63.0))

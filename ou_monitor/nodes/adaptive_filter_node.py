@@ -28,7 +28,7 @@ from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import (
     Console, decode, INPUT_QOS, NO_CLOCK, Silence, SourceFinder, Stamper, types_on, within)
 from ou_monitor.nodes.sources import AUTO, message_class, MOTOR_PARAMETERS, Source
-from ou_monitor.online.filter.cutoff_control import Bound
+from ou_monitor.online.filter.cutoff import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.notch import AdaptiveNotch
 from ou_monitor.online.settings import (

@@ -53,7 +53,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.filter.cutoff_control import SampleInterval
+from ou_monitor.online.filter.cutoff import SampleInterval
 from ou_monitor.online.filter.lowpass import FilterCounters, LARGEST, LATEST, SHORTEST
 from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray, NAN

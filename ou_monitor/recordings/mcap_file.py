@@ -193,8 +193,9 @@ class McapFile:
         words = f'at byte {first}: {why} (' + (
             'before the first message' if newest is None else
             moment(newest, self.origin_ns)) + ')'
+        end = ', after which the search ended' if rest + 1 >= _MOST_BREAKS else ''
         return words + (f'; and at {counted(rest, "more place")}, the last at byte '
-                        f'{self.breaks[-1][0]}' if rest else '')
+                        f'{self.breaks[-1][0]}{end}' if rest else '')
 
     def _break(self, offset: int, why: object) -> None:
         bisect.insort(self.breaks, (offset, str(why)))

@@ -5,7 +5,7 @@ import math
 from diagnostic_msgs.msg import DiagnosticArray
 from live import BAGS, values_of, wait_until
 import numpy as np
-from ou_monitor.online.filter.cutoff_laws import relative_cutoff
+from ou_monitor.online.filter.cutoff import relative_cutoff
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scipy import signal

@@ -5,7 +5,7 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from live import LowPass, to_stamp, values_of, wait_until
-from ou_monitor.online.filter.cutoff_laws import relative_cutoff
+from ou_monitor.online.filter.cutoff import relative_cutoff
 from ou_monitor.online.filter.filter_state import phase_lag
 import pytest
 from sensor_msgs.msg import Imu

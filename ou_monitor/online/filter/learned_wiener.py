@@ -42,7 +42,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.filter.cutoff_control import time_constant
+from ou_monitor.online.filter.cutoff import time_constant
 from ou_monitor.online.filter.filter_state import LowPassState, phase_lag, share_for_lag
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN

@@ -1,8 +1,8 @@
 """
 A low-pass, or filtered derivative, whose cutoff follows the noise of the supply.
 
-sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
-(`cutoff_control`) -> cutoff in force -> filter (`filter_state`) -> output.
+sigma -> law -> wanted cutoff -> limits, smoothing, slew -> cutoff in force (`cutoff`) -> filter
+(`filter_state`) -> output.
 
 The derivative is the same low-pass, applied to the slope of the input.  It does not jump when the
 cutoff changes, and is exact for an input that is linear between samples.
@@ -22,9 +22,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.filter.cutoff_control import (
-    Bound, CutoffControl, OF_RATE, SampleInterval)
-from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
+from ou_monitor.online.filter.cutoff import (
+    Bound, CutoffControl, OF_RATE, SampleInterval, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import (
     cutoff_for_lag, delay, LowPassState, most_lag, phase_lag)
 from ou_monitor.online.filter.learned_wiener import LearnedWiener

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.online.filter.cutoff_control import (
+from ou_monitor.online.filter.cutoff import (
     Bound, CutoffControl, SampleInterval, time_constant)
 from ou_monitor.online.settings import FilterSettings
 import pytest

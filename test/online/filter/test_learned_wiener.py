@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import AdaptiveLowPass
 from ou_monitor.online.filter import learned_wiener
-from ou_monitor.online.filter.cutoff_control import Bound
+from ou_monitor.online.filter.cutoff import Bound
 from ou_monitor.online.filter.filter_state import phase_lag
 import pytest
 from scipy import linalg, signal

@@ -5,8 +5,8 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import AdaptiveLowPass
-from ou_monitor.online.filter.cutoff_control import Bound
-from ou_monitor.online.filter.cutoff_laws import relative_cutoff
+from ou_monitor.online.filter.cutoff import Bound
+from ou_monitor.online.filter.cutoff import relative_cutoff
 from ou_monitor.online.settings import FILTER_PARAMETERS, FilterSettings
 import pytest
 

@@ -4,7 +4,7 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.filter.cutoff_laws import (
+from ou_monitor.online.filter.cutoff import (
     cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
