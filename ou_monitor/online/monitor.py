@@ -175,22 +175,21 @@ class SupplyMonitor:
         load = None if throttle is None else plausible(
             np.broadcast_to(as_numbers(throttle), volts.shape), MOST_THROTTLE)
         times = None if arrival is None else np.atleast_1d(as_seconds(arrival))
-        self._trust.push(stamps, volts, load, times)
-        self._flag.push(stamps, volts, times, self._trust.interval)
         part = slice(-self._phase % thin, None, thin)
         self._phase = (self._phase + stamps.size) % thin
         self._thinned += stamps.size - stamps[part].size
-        load = None if load is None else load[part]
         drawn = None if current is None else plausible(np.broadcast_to(
             as_numbers(current), stamps.shape)[part], MOST_CURRENT)
         came = math.inf if times is None or not times.size else float(times[-1])
+        columns = as_columns(stamps[part], volts[part], None if load is None else load[part], drawn)
         try:
-            columns = as_columns(stamps[part], volts[part], load, drawn)
             for batch in self._line.take(columns, self._sliding):
                 self._take(batch, came)
         except Exception as error:
             # Catch every error, because after an exception here nothing would be reported.
             self.restart(error)
+        self._trust.push(stamps, volts, load, times)
+        self._flag.push(stamps, volts, times, self._trust.interval)
 
     def _take(self, batch: Batch, came: float) -> None:
         """Pass on readings while the supply is on; start again when it is switched on."""
