@@ -146,7 +146,10 @@ def _evidence(gaps: FloatArray, period: float) -> float:
     if abs(period - round(period)) > _WHOLE:
         # With a fractional period gaps deviate by half a sample or more.
         width = max(width, 0.5)
-    return gaps.size * _divergence(1.0 - _ODD, _chance(period, width, int(gaps.max())))
+    share, chance = 1.0 - _ODD, max(_chance(period, width, int(gaps.max())), 1e-12)
+    # The Kullback-Leibler divergence of two Bernoulli laws.
+    return 0.0 if chance >= share else gaps.size * (
+        share * math.log(share / chance) + _ODD * math.log(_ODD / (1.0 - chance)))
 
 
 def _irregular(gaps: FloatArray, period: float) -> bool:
@@ -173,14 +176,6 @@ def _chance(period: float, width: float, longest: int) -> float:
     gaps = np.arange(1.0, max(longest, 20.0 * period) + 1.0)
     law = np.power(1.0 - 1.0 / period, gaps - 1.0) / period
     return float(law[np.abs(_excess(gaps, period)) <= width + 1e-9].sum())
-
-
-def _divergence(share: float, chance: float) -> float:
-    """Return the Kullback-Leibler divergence of two Bernoulli laws, nats; 0 if share <= chance."""
-    if chance >= share:
-        return 0.0
-    return (share * math.log(share / max(chance, 1e-12))
-            + (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)))
 
 
 def _several_sizes(sizes: FloatArray) -> bool:
@@ -467,8 +462,7 @@ TAIL, _ENOUGH, _LOOK = 1024, 64, 256
 _STRETCH = 20
 # Indices of samples, or a slice if all are meant.
 Picked = npt.NDArray[np.intp] | slice
-# Search for repeats if more than this share of the samples is equal to the previous one.  With
-# repeats, the share is at least a third.
+# Search for repeats if more than this share of the samples is equal to the previous one.
 _TIED = 0.25
 
 
@@ -622,7 +616,10 @@ class TimeLine:
         before = self._repeats.period
         if self._since_search >= (_LOOK if self._searched else _ENOUGH):
             self._since_search, self._searched = 0, True
-            self._repeats.period = self._refresh(before)
+            # With repeats, at least a third of the samples equal the previous one.
+            y = self._tail[1]
+            if before > 1.0 or float(np.mean(y[1:] == y[:-1])) > _TIED:
+                self._repeats.period = refresh_period(y, before)
         if self._repeats.period == 1.0:
             if before > 1.0:
                 self._repeats.forget()
@@ -635,13 +632,6 @@ class TimeLine:
         dropped = batch.t.size - (0 if kept is None else kept.t.size)
         self.count(held=dropped, used=-dropped)
         return [] if kept is None else [kept]
-
-    def _refresh(self, known: float) -> float:
-        """Return the samples per reading in the tail."""
-        y = self._tail[1]
-        if known == 1.0 and float(np.mean(y[1:] == y[:-1])) <= _TIED:
-            return 1.0
-        return refresh_period(y, known)
 
 
 def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',

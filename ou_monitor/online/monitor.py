@@ -181,7 +181,8 @@ class SupplyMonitor:
         drawn = None if current is None else plausible(np.broadcast_to(
             as_numbers(current), stamps.shape)[part], MOST_CURRENT)
         came = math.inf if times is None or not times.size else float(times[-1])
-        columns = as_columns(stamps[part], volts[part], None if load is None else load[part], drawn)
+        columns = as_columns(
+            stamps[part], volts[part], None if load is None else load[part], drawn)
         try:
             for batch in self._line.take(columns, self._sliding):
                 self._take(batch, came)

@@ -132,17 +132,14 @@ class Place:
 
     def column(self, rows: Rows) -> FloatArray:
         """Return the numbers of many messages, NaN where not finite."""
-        raw = self._view(rows)
+        raw = self.view(rows)
         found = (raw != 0 if self.kind.endswith('?') else raw).astype(np.float64)
         if not (finite := np.isfinite(raw)).all():
             found[~finite] = np.nan
         return found
 
-    def fill(self, rows: Rows, values: npt.ArrayLike) -> None:
-        """Write the numbers of many messages."""
-        self._view(rows)[...] = values
-
-    def _view(self, rows: Rows) -> npt.NDArray[Any]:
+    def view(self, rows: Rows) -> npt.NDArray[Any]:
+        """Return the numbers of many messages as they lie there."""
         kind = np.dtype('u1' if self.kind.endswith('?') else self.kind)
         shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
         if 0 in shape:
@@ -395,25 +392,6 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
     return places + np.arange(places.size)
 
 
-class ZeroRule:
-    """Turns zeros that mean "not measured" into NaN, according to `zero` of a msg config."""
-
-    def __init__(self, rule: str) -> None:
-        self._rule = rule
-
-    def apply(self, values: FloatArray) -> FloatArray:
-        """Return values with such zeros as NaN; pass them in order of arrival."""
-        if self._rule == 'value':
-            return values
-        nothing = values == 0.0
-        if self._rule == 'unknown_at_first':
-            something = np.flatnonzero(np.isfinite(values) & ~nothing)
-            if something.size:
-                self._rule = 'value'
-                nothing[int(something[0]):] = False
-        return np.where(nothing, np.nan, values) if nothing.any() else values
-
-
 class FieldReader:
     """
     Reads one field of messages of one type, and their stamps.
@@ -430,10 +408,12 @@ class FieldReader:
         self.spec = spec
         self._definitions, self._broken = definitions, broken
         self._kind = short_name(spec.type)
-        self._fields = [(one, value_path(one, definitions), ZeroRule(one.zero))
+        self._fields = [(one, value_path(one, definitions))
                         for one in (spec, beside) if one is not None]
+        # Whether a zero of each field means "not measured"; it may end with the first value.
+        self._no_zero = [one.zero != 'value' for one, _ in self._fields]
         self._stamp = stamp_paths(spec, definitions)
-        self._wanted = frozenset((*self._stamp, *(path for _, path, _ in self._fields)))
+        self._wanted = frozenset((*self._stamp, *(path for _, path in self._fields)))
         # Size of the message -> layouts found so far.
         self._layouts: dict[int, list[Layout]] = {}
 
@@ -449,8 +429,7 @@ class FieldReader:
         with np.errstate(invalid='ignore'):
             for picked, rows, layout in self._groups(table, refused):
                 stamp[picked] = self._stamps(layout, rows)
-                block, *other = (self._values(layout, rows, spec, path)
-                                 for spec, path, _ in self._fields)
+                block, *other = (self._values(layout, rows, *field) for field in self._fields)
                 blocks.append((picked, block))
                 count[picked] = block.shape[1]
                 if other and other[0].shape[1] == 1:
@@ -473,9 +452,20 @@ class FieldReader:
             column = column.take(np.flatnonzero(kept))
         elif self.spec.sample_rate is None:
             column = column._replace(counts=np.broadcast_to(np.int64(1), n))
-        zero, *others = (rule for _, _, rule in self._fields)
-        return column._replace(values=zero.apply(column.values),
-                               beside=others[0].apply(column.beside) if others else column.beside)
+        return column._replace(values=self._measured(0, column.values),
+                               beside=self._measured(-1, column.beside))
+
+    def _measured(self, which: int, values: FloatArray) -> FloatArray:
+        """Return values in order of arrival with zeros as NaN, by `zero` of a msg config."""
+        if not self._no_zero[which]:
+            return values
+        nothing = values == 0.0
+        if self._fields[which][0].zero == 'unknown_at_first':
+            something = np.flatnonzero(np.isfinite(values) & ~nothing)
+            if something.size:
+                self._no_zero[which] = False
+                nothing[int(something[0]):] = False
+        return np.where(nothing, np.nan, values) if nothing.any() else values
 
     def _groups(self, table: MessageTable, refused: dict[int, str],
                 ) -> Iterator[tuple[IntArray, Rows, Layout]]:

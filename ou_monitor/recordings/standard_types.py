@@ -164,7 +164,7 @@ def _encode(kind: str, columns: Mapping[str, npt.NDArray[Any]],
     data, layout = _template(kind, json.dumps(content), frozenset(paths))
     rows = np.tile(np.frombuffer(data, np.uint8), (len(next(iter(paths.values()))), 1))
     for path, values in paths.items():
-        layout.places[path].fill(rows, values)
+        layout.places[path].view(rows)[...] = values
     whole, size = rows.tobytes(), len(data)
     return [whole[at:at + size] for at in range(0, len(whole), size)]
 
