@@ -1,11 +1,13 @@
-"""`ou-monitor analyze`: CSV in; table, JSON and page out; one line for every bad input."""
+"""`ou-monitor analyze`: table, JSON and page; the limit; one line for every bad input."""
 
 import math
 import re
 
 from command_line import answer, failure, strict, write_csv
 import numpy as np
+from ou_monitor.analysis.crafts import pack_limit
 from ou_monitor.cli.main import main
+from ou_monitor.errors import InputError
 from ou_monitor.model.ou import simulate
 import pytest
 
@@ -115,16 +117,6 @@ def test_a_horizon_asked_for_is_that_of_every_budget(flight, capsys):
     assert (budget['throttle'], budget['horizon_s']) == (data['brownout']['throttle_budget'], 1.0)
 
 
-def test_a_part_is_analyzed_alone(flight, tmp_path, capsys):
-    """Seconds 2 to 5: one level of 3 s; the page says so in its command."""
-    report = tmp_path / 'part.html'
-    found = answer(capsys, 'analyze', flight, '--from', '2', '--to', '5', '--report', report)
-    assert (found['n'], len(found['levels'])) == (1500, 1)
-    assert found['levels'][0]['throttle'] == pytest.approx(0.1)
-    assert '--from 2 --to 5' in report.read_text(encoding='utf-8')
-    assert 'no' in failure(capsys, 'analyze', flight, '--from', '100')
-
-
 def test_the_default_of_a_5_v_rail_is_for_one(tmp_path, capsys):
     """A battery of four cells gets no risk against 4.5 V, and the reason."""
     rng = np.random.default_rng(3)
@@ -142,3 +134,23 @@ def test_the_default_of_a_5_v_rail_is_for_one(tmp_path, capsys):
     assert '--cells 4 (a guess from the voltage) sets it to 13.2 V (empty under load)' in said
     found = answer(capsys, 'analyze', path, '--brownout-voltage', '14')
     assert found['brownout']['voltage'] == 14.0 and 0.0 <= found['sliding']['brownout_risk'][-1]
+
+
+@pytest.mark.parametrize('voltage, cells, limit', [
+    (None, None, None), (14.0, None, 14.0), (None, 4, 13.2), (3.5, 4, 14.0), (3.5, 1, 3.5),
+    (4.5, None, 4.5)])
+def test_with_cells_the_limit_is_volts_per_cell(voltage, cells, limit):
+    """Without, of the whole; cells alone have a limit of their own."""
+    found = pack_limit(voltage, cells)
+    assert found == (None if limit is None else pytest.approx(limit, rel=1e-12))
+
+
+def test_volts_of_the_pack_beside_cells_are_refused():
+    with pytest.raises(InputError, match='no cell has 14 V: write 3.5, or leave --cells out'):
+        pack_limit(14.0, 4)
+
+
+@pytest.mark.parametrize('cells', ['0', '-1', '2.5', 'four', '99'])
+def test_an_invalid_number_of_cells_is_one_line(cells, capsys):
+    assert main(['analyze', 'x.csv', '--cells', cells]) == 2
+    assert f"'{cells}' is not a number of cells, 1 to 28" in capsys.readouterr().err

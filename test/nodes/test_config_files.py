@@ -1,12 +1,16 @@
-"""The shipped parameter file and launch file agree with the program."""
+"""The shipped parameter files and launch files agree with the program, and start its nodes."""
 
 import ast
+import os
 from pathlib import Path
 import re
+import shutil
+import signal
+import subprocess
 import sys
 from types import ModuleType
 
-from live import ROOT
+from live import ROOT, wait_until
 from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
 from ou_monitor.nodes.adc_node import AdcNode
 from ou_monitor.nodes.base import LOCK
@@ -215,3 +219,44 @@ def test_the_file_is_taken_in_any_namespace(world):
             assert answer.values[0].double_value == value
     assert all('[WARN]' not in process.err for process in processes)
     wait_until(lambda: [process.stop() for process in processes] == [0] * 4)
+
+
+needs_ros2 = pytest.mark.skipif(
+    shutil.which('ros2') is None or subprocess.run(
+        ['ros2', 'pkg', 'prefix', 'ou_monitor'], capture_output=True, check=False).returncode != 0,
+    reason='needs a sourced ROS 2 with `ros2 launch`, and the workspace of this package')
+
+LAUNCHED = {'ou_monitor_launch.py': ['/ou_estimator', '/ou_adaptive_filter'],
+         'ou_monitor_two_batteries_launch.py': [
+             '/battery_1/ou_estimator', '/battery_2/ou_estimator'],
+         'ou_monitor_simulated_launch.py': [
+             '/supply_simulator', '/ou_estimator', '/ou_adaptive_filter']}
+
+
+@needs_ros2
+@pytest.mark.parametrize('file', LAUNCHED)
+def test_nodes_come_up_and_end(world, file):
+    """Those that are described are seen, and SIGINT ends all of them with status 0."""
+    probe = world.probe()
+    launched = subprocess.Popen(
+        # -n: at a terminal `ros2 launch` leaves the signal of its nodes to the terminal.
+        ['ros2', 'launch', '-n', 'ou_monitor', file], start_new_session=True,
+        env={**os.environ, 'ROS_DOMAIN_ID': str(world.domain)})
+    try:
+        wait_until(lambda: set(LAUNCHED[file]) <= set(probe.node.get_fully_qualified_node_names()),
+                   what=f'{LAUNCHED[file]}')
+        launched.send_signal(signal.SIGINT)
+        assert launched.wait(60) == 0
+    finally:
+        if launched.poll() is None:
+            os.killpg(launched.pid, signal.SIGKILL)
+            launched.wait()
+
+
+@needs_ros2
+def test_a_missing_parameter_file_starts_no_node(tmp_path):
+    done = subprocess.run(
+        ['ros2', 'launch', 'ou_monitor', 'ou_monitor_launch.py',
+         f'params_file:={tmp_path}/none.yaml'], capture_output=True, text=True, timeout=120,
+        check=False)
+    assert done.returncode != 0 and 'there is no file' in done.stdout + done.stderr

@@ -1,9 +1,10 @@
-"""Two real estimators on one machine: silence, NaN, time that jumps back, parameters, types."""
+"""Real estimators: silence, NaN, bursts, time that jumps back, parameters, types."""
 
 import math
 import time
 
-from live import Estimator, ou_path, wait_until
+from diagnostic_msgs.msg import DiagnosticArray
+from live import Estimator, ou_path, values_of, wait_until
 import numpy as np
 import pytest
 from sensor_msgs.msg import BatteryState
@@ -142,6 +143,10 @@ def test_parameter_change_keeps_the_window(rig):
 @pytest.mark.parametrize('name, value, words', [
     ('window', 'long', "unknown 'long'"),
     ('brownout.warn', 0.5, 'must be less than brownout.critical'),
+    ('brownout.floor', 4.6, 'must not exceed brownout.voltage'),
+    ('brownout.horizon', 0.0, 'out of range'),
+    ('brownout.latch', 1.5, 'Wrong parameter type'),
+    ('model_file', '/no/such/model.yaml', 'cannot read the model file'),
     ('msg_config', 'px4', 'read-only'),
 ])
 def test_bad_parameters_are_refused(rig, name, value, words):
@@ -223,3 +228,25 @@ def test_another_type_than_configured_is_named(world):
     keep = probe.publisher('/c/voltage', Float64)
     wait_until(lambda: 'expects std_msgs/msg/Float32' in rig.status.message, what='complaint')
     assert keep and rig.status.level == b'\x02'
+
+
+def test_bursts_are_reported(world):
+    """1 kHz in bursts of 50, whose times of sending would give an alpha of 555 for 63."""
+    probe = world.probe()
+    states = probe.listen('/ou_estimator/state', DiagnosticArray)
+    sender = probe.publisher('/voltage', Float64, 1000)
+    process = world.start('estimator', '--ros-args', '-p', 'window:=4.0')
+    wait_until(lambda: 'voltage from' in process.err, what='subscription')
+    wait_until(sender.get_subscription_count)
+    path = ou_path(12_000, 0.001, seed=5)
+    begin = time.monotonic()
+    for k in range(0, len(path), 50):
+        time.sleep(max(begin + 0.001 * (k + 50) - time.monotonic(), 0.0))
+        for u in path[k:k + 50]:
+            sender.publish(Float64(data=u))
+        if states and 'in bursts' in states[-1].status[0].message:
+            break
+    assert 'in bursts' in states[-1].status[0].message
+    fields = values_of(states[-1].status[0])
+    assert fields['alpha'] == fields['smoothed_rate'] == 'nan'
+    assert process.stop() == 0

@@ -94,19 +94,6 @@ def test_the_floor_sets_the_latch_and_the_service_clears_it(rig):
     assert len(rig.flags) <= flags + 1 and rig.field('brownout') == 'unknown'
 
 
-@pytest.mark.parametrize('name, value, words', [
-    ('brownout.floor', 4.6, 'must not exceed brownout.voltage'),
-    ('brownout.horizon', 0.0, 'out of range'),
-    ('brownout.latch', 1.5, 'Wrong parameter type'),
-    ('model_file', '/no/such/model.yaml', 'cannot read the model file'),
-])
-def test_contradictions_are_refused_at_run_time(rig, name, value, words):
-    before = rig.get(name)
-    result = rig.probe.set_parameter(rig.node, name, value)
-    assert not result.successful and words in result.reason and '\n' not in result.reason
-    assert rig.get(name) == before
-
-
 def test_a_bad_model_file_leaves_the_old_one(rig, shared_world):
     good, bad = shared_world.folder / 'good.yaml', shared_world.folder / 'bad.yaml'
     good.write_text(MODEL)
