@@ -27,7 +27,6 @@ from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.time import Time
@@ -71,7 +70,8 @@ class MonitorNode(Node):
     def __init__(self, name: str, *, managed: bool = False) -> None:
         Node.__init__(self, name)
         self.managed = managed
-        self._made: list[Any] = []
+        # What the node had when it began; None before that.
+        self._before: set[Any] | None = None
         self._at_stop: list[Callable[[], object]] = []
         self.faults, self.fault = 0, ''
         self._faulted = -math.inf
@@ -109,6 +109,7 @@ class MonitorNode(Node):
 
     def begin(self) -> None:
         """Start; if that fails, close everything opened so far."""
+        self._before = self._entities
         try:
             self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
             self.start()
@@ -124,15 +125,15 @@ class MonitorNode(Node):
         if self._thread is not None:
             # The thread must end before the publishers are closed.
             self._thread.join(2.0)
-        for made in reversed(self._made):
+        for made in set() if self._before is None else self._entities - self._before:
             for destroy in (self.destroy_timer, self.destroy_subscription, self.destroy_service,
                             self.destroy_publisher):
                 if destroy(made):
                     break
         for close in self._at_stop:
             close()
-        del self._made[:], self._polled[:], self._at_stop[:]
-        self._publishing = None
+        del self._polled[:], self._at_stop[:]
+        self._publishing = self._before = None
 
     def run_beside(self, work: Callable[[], None]) -> None:
         """Run work in a thread; it must end when `ending` is set."""
@@ -175,9 +176,7 @@ class MonitorNode(Node):
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Call back every `period` s of real time, so that silence of `/clock` is detected too."""
-        timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
-        self._made.append(timer)
-        return timer
+        return self.create_timer(period, self.guarded(callback), clock=self.steady)
 
     def publish_every(self, callback: Callable[[], None]) -> None:
         """Call back at `publish_rate`, which may change."""
@@ -234,16 +233,13 @@ class MonitorNode(Node):
             part, level, summary, fields, self.stamp_now(), hardware_id))
 
     @property
+    def _entities(self) -> set[Any]:
+        return {*self.timers, *super().subscriptions, *self.services, *self.publishers}
+
+    @property
     def subscriptions(self) -> Iterator[Subscription]:
         """Return the subscriptions that an executor serves: all except polled ones."""
         return (s for s in super().subscriptions if s not in self._polled)
-
-    def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
-        return self._kept(super().create_publisher(kind, topic, qos, **options))
-
-    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any,
-                            **options: Any) -> Subscription:
-        return self._kept(super().create_subscription(kind, topic, callback, qos, **options))
 
     def serve(self, name: str, work: Callable[[], str]) -> None:
         """Offer a Trigger: `work` returns what was done, or refuses by an InputError."""
@@ -254,15 +250,6 @@ class MonitorNode(Node):
                 response.message, response.success = str(error), False
             return response
         self.create_service(Trigger, name, self.guarded(answer))
-
-    def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
-        return self._kept(super().create_service(kind, name, callback, **options))
-
-    def _kept(self, made: Any) -> Any:
-        """Record an object for `stop` to close, unless `Node.__init__` makes it for itself."""
-        if hasattr(self, '_made'):
-            self._made.append(made)
-        return made
 
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
         """Return a subscription whose messages wait in the middleware until they are taken."""
