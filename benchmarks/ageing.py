@@ -25,8 +25,9 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelComparison, ModelVerdict
 from ou_monitor.recordings.model_file import read_model
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
-from ou_monitor.simulation import read_throttle, RecordedThrottle, simulated
+from ou_monitor.simulation import recorded_throttle, simulated
 
 # Sampling rate, Hz; lengths of the flight for learning and of the compared flights, s.
 RATE, TAUGHT, LENGTH = 100.0, 120.0, 60.0
@@ -57,12 +58,14 @@ def learned(made: Recording) -> LoadStart | None:
     return loads.learned()
 
 
-def aged(model: SupplyModel, flown: RecordedThrottle, name: str, seeds: int) -> list[list[str]]:
+def aged(model: SupplyModel, flown: Recording, name: str, seeds: int) -> list[list[str]]:
     """Return a row for each age."""
+    throttle = recorded_throttle(flown, name)
+
     def flight(seed: int, age: float = 1.0, place: float = 0.0,
                length: float = LENGTH) -> Recording:
         (made,) = simulated(
-            model, lambda t: flown.profile((t + place * flown.duration) % flown.duration),
+            model, lambda t: throttle((t + place * flown.duration) % flown.duration),
             duration=length, rate=RATE, seed=seed, charge=math.nan, resistance=age)
         return made
 
@@ -132,7 +135,7 @@ def main() -> int:
         rows = []
         for run in options.runs:
             path, _, recording = run.partition(':')
-            rows += aged(read_model(path).model, read_throttle(recording), Path(path).stem,
+            rows += aged(read_model(path).model, read_recording(recording), Path(path).stem,
                          options.seeds)
         text = table(('model', 'sag factor', 'ever weaker', 'median s', 'sag now / then',
                       'noise now / then', 'another pack'), rows)

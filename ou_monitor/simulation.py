@@ -153,16 +153,6 @@ def _from_csv(path: Path, columns: CsvColumns | None) -> list[tuple[float, float
     return _checked(list(zip(t.tolist(), throttle.tolist())), str(path))
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedThrottle:
-    """Throttle as it was recorded."""
-
-    # Stamps, s from the start of the part -> throttle 0..1; each value holds until the next.
-    profile: Profile
-    duration: float  # Length of the part, s
-    recording: Recording  # The part
-
-
 def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
     """Return whether the text for a throttle names a recording (columns: for a CSV)."""
     path = Path(text)
@@ -173,31 +163,23 @@ def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
     return not table or holds_supply(path, columns)
 
 
-def read_throttle(text: str, start: float | None = None, end: float | None = None,
-                  columns: CsvColumns | None = None, full: float = 0.0) -> RecordedThrottle:
-    """Return the throttle of a recording from start to end, s after its first sample."""
-    return recorded_throttle(read_recording(text, start=start, end=end, columns=columns), text,
-                             full)
-
-
-def recorded_throttle(recording: Recording, name: str, full: float = 0.0) -> RecordedThrottle:
+def recorded_throttle(recording: Recording, name: str, full: float = 0.0) -> Profile:
     """Return a recording's throttle, or its current divided by `full`, A (name: for errors)."""
-    duration = float(recording.t[-1] - recording.t[0])
+    # Stamps count from the first sample; each value holds until the next.
+    t = recording.t - recording.t[0]
     if full:
         if recording.current is None or not np.isfinite(recording.current).any():
             raise InputError(f"--throttle '{name}': the load of this model is a current (1 = "
                              f'{full:.4g} A), and the recording has none')
         known = np.isfinite(recording.current)
-        return RecordedThrottle(partial(_held, recording.t[known] - recording.t[0],
-                                        recording.current[known] / full), duration, recording)
+        return partial(_held, t[known], recording.current[known] / full)
     known = np.isfinite(recording.throttle)
     if not known.any():
         raise InputError(f"--throttle '{name}': the recording has no throttle: name its column or "
                          'series with --throttle-column')
-    t, u = recording.t[known] - recording.t[0], recording.throttle[known]
     # The reader has already refused percent and pulses; calibrated sticks may slightly exceed
     # 0..1.
-    return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)), duration, recording)
+    return partial(_held, t[known], np.clip(recording.throttle[known], 0.0, 1.0))
 
 
 def _held(t: FloatArray, u: FloatArray, at: FloatArray) -> FloatArray:
@@ -439,16 +421,13 @@ def _throttle_of(throttle: Any, start: float | None, end: float | None,
                  columns: CsvColumns | None, full: float
                  ) -> tuple[Profile, str, Recording | None, float]:
     """Return the profile of a throttle, its name, its recording, and its length, s, or NaN."""
-    found: RecordedThrottle | None = None
     words = throttle.name if isinstance(throttle, Recording) else str(throttle)
-    if isinstance(throttle, Recording):
-        found = recorded_throttle(throttle, words, full)
-    elif callable(throttle):
+    if callable(throttle):
         return throttle, 'given', None, NAN
-    elif is_recording(words, columns):
-        found = read_throttle(words, start, end, columns, full)
-    if found is not None:
-        return found.profile, words, found.recording, found.duration
+    flown = throttle if isinstance(throttle, Recording) else read_recording(
+        words, start=start, end=end, columns=columns) if is_recording(words, columns) else None
+    if flown is not None:
+        return recorded_throttle(flown, words, full), words, flown, flown.duration
     if start is not None or end is not None:
         raise InputError('--from and --to take a part of a recorded throttle: give --throttle '
                          'RECORDING')

@@ -24,9 +24,10 @@ from ou_monitor.nodes.inputs import (
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.settings import Parameter
 from ou_monitor.recordings.model_file import read_model
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import FloatArray, Level
 from ou_monitor.simulation import (
-    is_recording, lacks, Profile, read_profile, read_throttle, RunningSupply, STICK_RATE)
+    is_recording, lacks, Profile, read_profile, recorded_throttle, RunningSupply, STICK_RATE)
 from ou_monitor.stream.config import parse_field_path, put, walk
 
 # These are read again at each reset; scale_resistance also takes effect at once.
@@ -185,8 +186,9 @@ class SupplySimulatorNode(MonitorNode):
             raise InputError('throttle.play: the msg_config has no throttle to publish it on')
         sender = Sender(self, self._throttle_source)
         if is_recording(text):
-            found = read_throttle(text, full=self._model.full_current)
-            return found.profile, found.duration, sender
+            flown = read_recording(text)
+            return (recorded_throttle(flown, text, self._model.full_current), flown.duration,
+                    sender)
         return read_profile(text), math.inf, sender
 
     # -- throttle

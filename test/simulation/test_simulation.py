@@ -20,7 +20,7 @@ from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.simulation import (
-    constant, is_recording, lacks, plan, PRESETS, PROFILES, read_profile, read_throttle,
+    constant, is_recording, lacks, plan, PRESETS, PROFILES, read_profile,
     RunningSupply, simulated, through)
 import pytest
 
@@ -140,11 +140,11 @@ def flight(tmp_path):
 
 def test_each_value_holds_until_the_next(flight):
     """Stamps count from the begin of the part, and the last value stays."""
-    whole = read_throttle(str(flight))
-    assert whole.duration == 4.0
+    run = plan(throttle=str(flight))
+    assert run.duration == 4.0
     at = np.array([0.0, 1.5, 2.0, 2.999, 3.0, 99.0])
-    np.testing.assert_allclose(whole.profile(at), [0.1, 0.1, 0.6, 0.6, 0.2, 0.2])
-    part = read_throttle(str(flight), 2.0, 4.0)
+    np.testing.assert_allclose(run.profile(at), [0.1, 0.1, 0.6, 0.6, 0.2, 0.2])
+    part = plan(throttle=str(flight), start=2.0, end=4.0)
     assert part.duration == 1.0
     np.testing.assert_allclose(part.profile(np.array([0.0, 1.0])), [0.6, 0.2])
 
@@ -178,12 +178,12 @@ def test_throttle_of_an_unusable_recording_is_refused(flight, tmp_path, capsys):
     none = tmp_path / 'none.csv'
     none.write_text('time_s,voltage_v\n0,5\n1,5\n', encoding='utf-8')
     with pytest.raises(InputError, match='has no throttle'):
-        read_throttle(str(none))
+        plan(throttle=str(none))
     percent = tmp_path / 'percent.csv'
     percent.write_text(
         'time_s,voltage_v,throttle\n0,5,400\n1,5,870\n', encoding='utf-8')
     with pytest.raises(InputError, match='throttle runs from 400 to 870'):
-        read_throttle(str(percent))
+        plan(throttle=str(percent))
     assert main(['simulate', '--throttle', 'flight', '--from', '1', '--output',
                  str(tmp_path / 'x.mcap')]) == 2
     assert 'give --throttle RECORDING' in capsys.readouterr().err

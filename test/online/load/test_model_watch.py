@@ -15,13 +15,15 @@ from ou_monitor.model.terms.slow import Drift
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelVerdict
 from ou_monitor.recordings.model_file import read_model
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Level, Recording
-from ou_monitor.simulation import constant, Profile, read_throttle, simulated
+from ou_monitor.simulation import constant, Profile, recorded_throttle, simulated
 import pytest
 
 # Learned from the recorded flight whose throttle the simulated ones have.
 GECKO = read_model(ROOT / 'models' / 'gecko.yaml').model
-FLOWN: Profile = read_throttle(str(ROOT / 'bags' / 'recorded' / 'gecko.csv')).profile
+FLOWN: Profile = recorded_throttle(read_recording(
+    ROOT / 'bags' / 'recorded' / 'gecko.csv'), 'gecko')
 
 
 def flight(duration, seed, *, age=1.0, throttle=FLOWN):
