@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 import math
 
 import numpy as np
@@ -151,13 +150,10 @@ def _fall_within_budget(analysis: Analysis) -> str:
 
 
 def _why_no_throttle(analysis: Analysis) -> str:
-    """Return when no throttle is safe, in words: at the end, after this flight, or at idle."""
-    rest, last = analysis.overview.load.level, float(analysis.recording.voltage[-1])
-    if last < analysis.by_throttle.voltage < rest:
-        return f'at the end of this recording, where the voltage is {number(last, 4)} V'
-    if rest > analysis.by_throttle.voltage:
-        return f'right after this flight, though the supply at rest is at {number(rest, 4)} V'
-    return f'even at idle, as the supply at rest is at {number(rest, 4)} V'
+    """Return the voltages from which no throttle is safe, in words."""
+    return (f'at the end of this recording, where the voltage is '
+            f'{number(float(analysis.recording.voltage[-1]), 4)} V, and '
+            f'{number(analysis.overview.load.level, 4)} V at rest')
 
 
 def _origin(analysis: Analysis) -> list[tuple[str, str]]:
@@ -176,11 +172,6 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
 
 
-# Ratio of the relaxation's rms to the median noise at steady throttle, above which both values are
-# reported.
-_MIXED = 1.2
-
-
 def _numbers(analysis: Analysis) -> list[str]:
     whole, recording = analysis.overview.whole, analysis.recording
     ou = whole or analysis.overview.facts.ou
@@ -192,34 +183,12 @@ def _numbers(analysis: Analysis) -> list[str]:
     # 5 % to 95 %, so that a few unusual readings do not count.
     flown = dict.fromkeys(f'{x:.0f}' for x in np.quantile(held, (0.05, 0.95))) if held.size else ()
     at = f' at {" to ".join(flown)} % throttle' if flown else ''
-    found = [f'The noise of {"all" if whole else "the last"} {number(ou.window_s)} s{at} (level '
-             f'and response to load removed) has sigma = {number(ou.sigma)} (95 % '
-             f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s), relaxes in tau = '
-             f'{number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) ms, '
-             f'and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
-    steady = [level.estimate for level in analysis.levels if level.estimate.usable]
-    differing = []
-    if steady and all(e.interval('sigma')[1] < ou.sigma_95[0] for e in steady):
-        differing.append(f'sigma is {_range([e.sigma for e in steady])} V/sqrt(s)')
-    ends = np.array([e.interval('alpha') for e in steady]).reshape(-1, 2)
-    if steady and ((ends[:, 1] < low).all() or (ends[:, 0] > high).all()):
-        differing.append(f'tau is {_range([1e3 / e.alpha for e in steady])} ms')
-    # The steady noise includes white noise, so the relaxation alone cannot exceed it.
-    noise = analysis.overview.facts.noise
-    calm = [1e3 * x for u, x in zip(noise.throttle, noise.steady_rms_v)
-            if noise.flown[0] <= u <= noise.flown[1] and math.isfinite(x)]
-    if calm and 1e3 * math.sqrt(ou.var_inf) > _MIXED * float(np.median(calm)):
-        differing.append(f'the noise is {_range(calm)} mV rms')
-    if differing:
-        where = ('At steady throttle' if analysis.recording.has_throttle else
-                 'Over the whole recording')
-        found.append(f'{where} {listed(differing)}: the values above also include transients '
-                     'after load changes, or spectral lines.')
-    return found
-
-
-def _range(values: Sequence[float]) -> str:
-    return ' to '.join(dict.fromkeys(number(x) for x in (min(values), max(values))))
+    return [f'The noise of {"all" if whole else "the last"} {number(ou.window_s)} s{at} (level '
+            'and response to load removed; transients after load changes, and lines, included) '
+            f'has sigma = {number(ou.sigma)} (95 % {number(ou.sigma_95[0])} to '
+            f'{number(ou.sigma_95[1])}) V/sqrt(s), relaxes in tau = {number(1e3 / ou.alpha)} '
+            f'(95 % {number(1e3 / high)} to {number(1e3 / low)}) ms, and has a standard deviation '
+            f'of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
 
 
 def _change(analysis: Analysis) -> list[str]:

@@ -10,15 +10,12 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.discovery.finding import Criticism, Finding
 from ou_monitor.discovery.words import (
-    both_names, by_load, cause_rows, curve_text, GAIN, gain_text, input_words, parameters,
+    by_load, cause_rows, curve_text, GAIN, gain_text, input_words, parameters,
     plain_words, with_error)
-from ou_monitor.model.terms.regime_switching import RegimeSwitching
-from ou_monitor.model.terms.term import Role
-from ou_monitor.records import NAN
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number, Z95
+from ou_monitor.text import number
 
 # Maximum remaining discrepancies on a terminal.
 _SHOWN = 8
@@ -46,7 +43,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None) -> Docume
         after = ' before and after' if finding.causes else ''
         parts += [Section('Causes', _causes(finding)),
                   Section('Gain' if finding.causes else 'What it predicts',
-                          _gain(finding, seen)),
+                          _gain(finding)),
                   lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True)],
                   Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
@@ -104,7 +101,7 @@ def _causes(finding: Finding) -> list[Part]:
              legend=True)]
 
 
-def _gain(finding: Finding, seen: Overview | None) -> list[Part]:
+def _gain(finding: Finding) -> list[Part]:
     dips, baseline = finding.dips, finding.baseline
     assert baseline is not None and finding.model is not None
     ou = finding.model.terms[0]
@@ -120,42 +117,10 @@ def _gain(finding: Finding, seen: Overview | None) -> list[Part]:
                       '' if finding.refused else _under_load(finding)),
             Text('The plain OU, whose noise includes changes of level and load, has '
                  f'{parameters(baseline, {})}.' + (
-                     f' The extended model has {parameters(ou, finding.se[0])}.'
-                     f'{_disagreement(finding, seen)}' if finding.causes else ''))]
-
-
-def _disagreement(finding: Finding, seen: Overview | None) -> str:
-    """Return how the model's relaxation differs from the supply's and why, or ''."""
-    assert finding.model is not None
-    ou = finding.model.terms[0].values()
-    alpha, se = ou['alpha'], finding.se[0].get('alpha', NAN)
-    supply = None if seen is None else seen.facts.ou
-    if supply is None:
-        return ''
-    if supply.status == 'not_visible':
-        # NaN and infinite bounds compare as false.
-        beyond = bool(alpha * supply.tau_below_s < 1.0
-                      and ou['sigma'] ** 2 > 2.0 * alpha * supply.var_inf_below)
-        return (' The bound under Relaxation is lower, because it counts such slow changes as '
-                'changes of the level.') * beyond
-    # Three standard errors: two estimates of one rate differ by more once in 370 times.
-    if supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
-            3.0 * math.hypot(supply.log_se('alpha'), se / alpha)):
-        return ''
-    # The fit under Relaxation removes load, its lags and lines, but no other process with memory.
-    inside = dict.fromkeys(
-        both_names(term.NAME) for term, se in zip(finding.model.terms[1:], finding.se[1:])
-        if term.ROLE is Role.BLOCK
-        or (term.ROLE is Role.MEAN and term.FAMILY not in ('load', 'slow', 'line'))
-        or (term.NAME == RegimeSwitching.NAME
-            and abs(term.values()['level']) > Z95 * se['level']))
-    return (f' Its alpha disagrees with the one under Relaxation ({number(supply.alpha)} 1/s, '
-            f'from the last {number(supply.window_s)} s): ' + (
-                f'that value also contains {" and ".join(inside)}, which the model separates.'
-                if inside else
-                'the model also fits errors of its response to load; trust that value.'
-                if finding.remaining else
-                'no statistic contradicts the model, so the relaxation seems to change.'))
+                     f' The extended model has {parameters(ou, finding.se[0])}. The alpha under '
+                     'Relaxation is from the end of the recording, includes causes other than '
+                     'load, drift and lines, and counts slow changes as changes of the level.'
+                     if finding.causes else ''))]
 
 
 def _under_load(finding: Finding) -> str:

@@ -1,6 +1,5 @@
 """From a recording to a finding and its page: clear causes, bad input, correct verdicts."""
 
-from dataclasses import replace
 import json
 import math
 import re
@@ -10,15 +9,13 @@ import sys
 import numpy as np
 import ou_monitor
 from ou_monitor import discover
-from ou_monitor.analysis.overview import overview
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import HeldSamples
-from ou_monitor.model.terms.regime_switching import RegimeSwitching
-from ou_monitor.records import OuFacts, Recording
+from ou_monitor.records import Recording
 from ou_monitor.report.discovery_document import discovery_document
 from ou_monitor.report.page import html as page_of
 from ou_monitor.report.terminal import terminal
@@ -169,36 +166,3 @@ def test_ctrl_c_ends_the_search_and_the_gains(limit):
 
     with pytest.raises(KeyboardInterrupt):
         discover(drawn_from(LoadSag(0.5, 0.0), n=6000), progress=progress)
-
-
-def test_relaxation_of_the_model_beyond_the_bound_is_explained(sag):
-    """Where the supply shows no relaxation as slow and large, the page says why the model does."""
-    tau, var = 1.0 / sag.model.terms[0].alpha, sag.model.terms[0].sigma ** 2 / (
-        2.0 * sag.model.terms[0].alpha)
-    seen = overview(drawn_from(n=2000))
-
-    def shown(below_s, below_v2):
-        ou = OuFacts('not_visible', 60.0, tau_below_s=below_s, var_inf_below=below_v2)
-        return ' '.join(terminal(discovery_document(
-            sag, replace(seen, facts=replace(seen.facts, ou=ou)))).split())
-
-    words = 'counts such slow changes as changes of the level'
-    assert words in shown(0.5 * tau, 0.5 * var)
-    assert words not in shown(2.0 * tau, 0.5 * var)
-    assert words not in shown(0.5 * tau, 2.0 * var)
-
-
-@pytest.mark.parametrize('level, words', [
-    (0.2, 'also contains two states of the supply (regime_switching), which the model separates.'),
-    (0.0, 'so the relaxation seems to change.')])
-def test_a_process_that_only_the_model_separates_explains_its_alpha(sag, level, words):
-    """The supply's fit takes switching of the level, but not of sigma, for its relaxation."""
-    switching = RegimeSwitching(1.0, 1.0, level, 2.0, 1.0, 2.0)
-    found = replace(sag.record, model=SupplyModel((*sag.model.terms, switching)), criticism=(),
-                    se=(*sag.se, {'level': 0.01}))
-    alpha = 0.1 * sag.model.ou.alpha
-    ou = OuFacts('ok', 60.0, alpha, (0.9 * alpha, 1.1 * alpha), 0.3, (0.2, 0.4), 0.01, (0.0, 0.1))
-    seen = overview(drawn_from(n=2000))
-    shown = ' '.join(terminal(discovery_document(
-        found, replace(seen, facts=replace(seen.facts, ou=ou)))).split())
-    assert words in shown
