@@ -9,7 +9,6 @@ import re
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import (
     DRIFT_RATE, Judgement, LEAST, LEAST_FLIGHTS, LEAST_VEHICLES, OF_PACK, OUTLIER_RATE, QUANTITIES,
@@ -75,7 +74,7 @@ def fleet_document(fleet: Fleet) -> Document:
             Text('Lowest voltage and total dips of all flights.' + (
                 ' sigma and alpha: medians as measured; "per flight": drift at the common '
                 'throttle. A star marks what stands out.' if {*VEHICLE_HEADS[4:]}.intersection(
-                    vehicles.heads) else ''), legend=True), lambda: _strips(fleet)]
+                    vehicles.heads) else ''), legend=True)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
                  Section('Verdicts and causes', _causes(fleet), folded=True)],
@@ -104,11 +103,9 @@ def _ageing(fleet: Fleet) -> str:
                  + ', '.join(_growth(judged, t) for t in old if t.vehicle == vehicle)
                  for vehicle in dict.fromkeys(t.vehicle for t in old)]
         more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
-        likely = {t.vehicle for t in tested if t.low > 0.0} - {t.vehicle for t in old}
-        also = f'; the 95 % interval of {len(likely)} more is also above 0' if likely else ''
         doubt = '' if certain else f'; not certain among {counted(len(judged.trends), "test")}'
         return (f'{"A" if certain else "Possibly a"}geing pack{"s" * (len(words) > 1)} '
-                f'({len(words)} of {len({t.vehicle for t in tested})}{also}): '
+                f'({len(words)} of {len({t.vehicle for t in tested})}): '
                 f'{"; ".join(words[:_OLD])}{more}{doubt}.')
     if not tested:
         return (f'Whether a pack ages is unknown: no vehicle has {LEAST_FLIGHTS} flights with a '
@@ -116,8 +113,6 @@ def _ageing(fleet: Fleet) -> str:
     least = {vehicle: min((t for t in tested if t.vehicle == vehicle), key=lambda t: t.high)
              for vehicle in {t.vehicle for t in tested}}
     most = max(least.values(), key=lambda t: t.high)
-    if most.high <= 0.0:
-        return f'No pack ages: {most.quantity} falls on every vehicle tested.'
     return (f'No ageing pack is detected; not excluded (95 %): {most.quantity} '
             f'{change(most.high)} per flight on {most.vehicle}, which has {most.flights} flights.')
 
@@ -554,47 +549,23 @@ def _cell(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
 def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
     names = [*fleet.vehicles, *(['unknown'] if any(row['vehicle'] is None for row in rows)
                                 else [])]
-    under = np.array([bool(row['dips']) for row in rows])
     plot = Plot('Lowest voltage of every recording', 'vehicle', 'V', height=240)
-    _dots(plot, names, [row['vehicle'] or 'unknown' for row in rows],
-          np.array([float(row['flight'] or 0) for row in rows]),
-          np.array([row['lowest'] for row in rows]), under,
-          ('recordings' if under.any() else '', 'with dips'))
-    if math.isfinite(fleet.limit):
-        plot.level((0.4, len(names) + 0.6), fleet.limit, f'limit {fleet.limit:g} V')
-    return plot
-
-
-def _dots(plot: Plot, names: Sequence[str], vehicles: Sequence[str], flights: FloatArray,
-          y: FloatArray, marked: npt.NDArray[np.bool_], words: tuple[str, str]) -> None:
-    """Draw a dot for each recording above its vehicle, in the order of flights."""
     plot.places(list(short_names(names).values()))
-    x = np.array([names.index(v) + 1.0 if v else np.nan for v in vehicles])
-    for place in np.unique(x[np.isfinite(x)]):
+    x = np.array([names.index(row['vehicle'] or 'unknown') + 1.0 for row in rows])
+    flights = np.array([row['flight'] or 0 for row in rows])
+    for place in np.unique(x):
         mine = np.flatnonzero(x == place)
         if mine.size > 1:
-            # Side by side, so that a drift appears as a slope.
+            # Side by side in the order of flights, so that a drift appears as a slope.
             x[mine[np.argsort(flights[mine], kind='stable')]] += np.linspace(
                 -0.32, 0.32, mine.size)
-    for chosen, text, colour in ((~marked, words[0], 0), (marked, words[1], 1)):
-        if chosen.any() or not colour:
-            plot.markers(x[chosen], y[chosen], text, colour)
-
-
-def _strips(fleet: Fleet) -> list[Part]:
-    return [Figure(_by_vehicle(fleet, values), (
-        'As measured: the mean over the levels of each recording.' if name == 'sigma' else ''))
-        for name in ('sigma', 'alpha') if (values := fleet.judgement.values[name]).value.size]
-
-
-def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
-    plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
-                height=260, log_y=True)
-    for k in range(0, len(fleet.vehicles), 2):
-        plot.shade(k + 0.5, k + 1.5, 7)
-    _dots(plot, fleet.vehicles, values.vehicles, values.flights.astype(np.float64),
-          values.measured, fleet.judgement.recordings[values.name].found,
-          ('recordings', 'outliers of their vehicle'))
+    lowest = np.array([row['lowest'] for row in rows])
+    under = np.array([bool(row['dips']) for row in rows])
+    plot.markers(x[~under], lowest[~under], 'recordings' if under.any() else '', 0)
+    if under.any():
+        plot.markers(x[under], lowest[under], 'with dips', 1)
+    if math.isfinite(fleet.limit):
+        plot.level((0.4, len(names) + 0.6), fleet.limit, f'limit {fleet.limit:g} V')
     return plot
 
 
