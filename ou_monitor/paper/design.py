@@ -418,18 +418,9 @@ def _uf(row: DesignRow) -> str:
 
 def remarks(result: Design) -> list[str]:
     """Return further remarks."""
-    notes = []
-    rail = rail_at(result.network, result.throttle, result.rail)
-    if any(math.isclose(rail.alpha, rate, rel_tol=1e-6) for rate in rail.source_rates):
-        notes.append('With the present capacitor, alpha is the rate of the noise; capacitance '
-                     'changes alpha only when it makes the network slower than the noise.')
-    if result.least is not None and result.least.risk_crossing > result.least.risk_ou:
-        notes.append('The crossing rate of the whole process decides: part of the noise is '
-                     'faster than the OU of the slowest pole.')
-    if not result.falls:
-        notes.append('More capacitance does not always lower the risk here (ESR): choose a value '
-                     'from the table.')
-    return notes
+    return [] if result.falls else [
+        'More capacitance does not always lower the risk here (ESR): choose a value from the '
+        'table.']
 
 
 def probability(value: float) -> str:
