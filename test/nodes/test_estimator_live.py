@@ -143,7 +143,7 @@ def test_parameter_change_keeps_the_window(rig):
 @pytest.mark.parametrize('name, value, words', [
     ('window', 'long', "unknown 'long'"),
     ('brownout.warn', 0.5, 'must be less than brownout.critical'),
-    ('brownout.floor', 4.6, 'must not exceed brownout.voltage'),
+    ('brownout.floor', 4.9, 'must not exceed brownout.voltage'),
     ('brownout.horizon', 0.0, 'out of range'),
     ('brownout.latch', 1.5, 'Wrong parameter type'),
     ('model_file', '/no/such/model.yaml', 'cannot read the model file'),
