@@ -403,7 +403,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             raise InputError(f'cells: {cells} and {values["cells"]} are both given: give one; for '
                              'a pack of another voltage, --set battery_voltage=V')
         voltage = pack_limit(voltage, cells) if voltage and rail == 'bus' else voltage
-    taken, facts, known, assumed = '', None, None, False
+    taken, facts, error, known, assumed = '', None, 0.0, None, False
     if recording is None:
         if throttle is None:
             raise ValueError('the throttle is missing: pass 0.4 for 40 %, or a recording, whose '
@@ -456,13 +456,15 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             level, source = default_voltage(0, circuit.regulator_voltage)
         assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
         share = circuit.battery_resistance / flight.resistance if flight.resistance > 0.0 else 1.0
+        taken = taken_words(flight, circuit, throttle, assumed, origin) + load
+        error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
+            throttle, flight.throttle, flight.sag))
         if risk_of is not None and not values.keys() & SHOWN and facts.budget is not None and (
                 math.isfinite(facts.budget.throttle)):
             known = partial(risk_of, share=share, rise=circuit.battery_voltage - flight.level)
-        taken = taken_words(flight, circuit, throttle, assumed, origin, known is not None) + load
     found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
                      esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST),
-                     flown=known, assumed=assumed)
+                     sag_error=error, flown=known, assumed=assumed)
     return Result(found, partial(design_document, found, source, taken),
                   partial(as_data, found, source, taken), 'rows', facts)
 

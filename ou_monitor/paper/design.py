@@ -18,13 +18,13 @@ components, the sag is scaled with the resistance, and the noise with the noise 
 a resistance or battery voltage is given, the motor current stays as computed with the recorded
 resistance, as in the rows of the table. A component that the recording does not show (the
 capacitor; without a measured current also the resistance) is taken to be the recorded craft's,
-whether it is given or the default. These risks include the errors of sag and level, and the
-scatter that throttle did not explain. Limits: sag and noise are as measured, including the white
-noise and the filter of the sensor. Noise added by changes of throttle, and an OU if one was found,
-count as slow fluctuations of the current, which capacitors on a board do not change. The rest of
-the noise is attributed to the switching of the ESCs. Without a measured current, the resistance is
-the given or default one, and the current is scaled to fit the sag. The effect of packs in parallel
-is then still right, but the effect of an ESR is uncertain.
+whether it is given or the default. The risks include the errors of sag and level, and the scatter
+that throttle did not explain. Limits: sag and noise are as measured, including the white noise and
+the filter of the sensor. Noise added by changes of throttle, and an OU if one was found, count as
+slow fluctuations of the current, which capacitors on a board do not change. The rest of the noise
+is attributed to the switching of the ESCs. Without a measured current, the resistance is the given
+or default one, and the current is scaled to fit the sag. The effect of packs in parallel is then
+still right, but the effect of an ESR is uncertain.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from ou_monitor.online.settings import DEFAULT_LIMIT, RAIL
 from ou_monitor.paper.network import completed, PowerNetwork, Rail, rail_at
 from ou_monitor.text import number, percent
 from scipy.optimize import brentq
+from scipy.special import ndtr
 
 CELL_BROWNOUT = 3.3  # Brown-out level of a LiPo cell, V
 # Range of a rail, V -> (brown-out level, V, source); 3.3 V +- 0.3 V by JEDEC JESD8C.
@@ -55,6 +56,9 @@ _NEVER = 1e-300
 # Limits of the alternatives to capacitors: maximum packs in parallel, minimum share of the present
 # resistance (new leads and a fresh pack), and of the present throttle.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
+# Quadrature over the error of a mean: range, standard errors; Gauss-Legendre nodes and weights.
+_FAR = 8.0
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
 # Throttle, and factors on the sag and on the variance of the noise -> risk of a flight.
@@ -86,8 +90,8 @@ class DesignRow:
     # Sag of the bus and mean of the rail, V; independent of the capacitor.
     sag: float
     mean: float
-    # Mean time to brown-out of the OU from its mean, s; may be inf. Of a flight, it is computed
-    # from its risk.
+    # Mean time to brown-out of the OU from its mean, s; may be inf. If the mean has an error, this
+    # is computed from `risk_ou`.
     mean_time: float
     crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
     # Probability within the horizon, by mean first passage of the OU and by the crossing rate.
@@ -147,6 +151,7 @@ class Design:
     # the rail is regulated.
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
+    sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
     assumed: bool = False  # Whether the battery resistance is assumed, and so shown in %
 
 
@@ -168,16 +173,28 @@ def with_capacitance(network: PowerNetwork, capacitance: float,
     return replace(network, bulk_capacitance=capacitance, bulk_esr=ratio * network.bulk_esr)
 
 
-def row_of(rail: Rail, voltage: float, horizon: float) -> DesignRow:
-    """Return the numbers of a rail."""
+def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -> DesignRow:
+    """Return the numbers of a rail (sag_error: standard error of the sag of the bus, relative)."""
+    quiet = rail.var_inf == 0.0
     mean_time, crossing = _times(rail, voltage)
+    se = sag_error * rail.load.sag if rail.name == 'bus' else 0.0
+    if se > 0.0:
+        # Where the uncertain mean is below the voltage, the risk is 1; integrate over the rest.
+        lowest = max((voltage - rail.mean) / se, -_FAR)
+        risks = np.full(2, float(ndtr((voltage - rail.mean) / se)))
+        z = lowest + 0.5 * (_FAR - lowest) * (_NODES + 1.0)
+        weight = 0.5 * (_FAR - lowest) * _WEIGHTS * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+        for share, off in zip(weight.tolist() if lowest < _FAR else (), (se * z).tolist()):
+            risks += share * np.array(_risks(horizon, *_times(rail, voltage - off)))
+        rate = -np.log1p(-np.minimum(risks, 1.0 - 1e-16)) / horizon
+        mean_time, crossing = math.inf if rate[0] == 0.0 else 1.0 / float(rate[0]), float(rate[1])
     net = rail.network
+    risk_ou, risk_crossing = _risks(horizon, mean_time, crossing)
     return DesignRow(
         capacitance=net.bulk_capacitance, esr=net.bulk_esr, alpha=rail.alpha, tau=rail.tau,
-        sigma=0.0 if rail.var_inf == 0.0 else rail.sigma, var_inf=rail.var_inf,
-        sag=rail.load.sag, mean=rail.mean, mean_time=mean_time, crossing_rate=crossing,
-        risk_ou=1.0 if mean_time == 0.0 else -math.expm1(-horizon / mean_time),
-        risk_crossing=-math.expm1(-horizon * crossing))
+        sigma=0.0 if quiet else rail.sigma, var_inf=rail.var_inf, sag=rail.load.sag,
+        mean=rail.mean, mean_time=mean_time, crossing_rate=crossing, risk_ou=risk_ou,
+        risk_crossing=risk_crossing)
 
 
 def _times(rail: Rail, voltage: float) -> tuple[float, float]:
@@ -190,16 +207,22 @@ def _times(rail: Rail, voltage: float) -> tuple[float, float]:
     return mean_first_passage(0.0, barrier) * rail.tau, rail.crossing_rate(voltage)
 
 
+def _risks(horizon: float, mean_time: float, crossing: float) -> tuple[float, float]:
+    """Return the risks within a horizon, s: first passage of the OU, crossing rate."""
+    return (1.0 if mean_time == 0.0 else -math.expm1(-horizon / mean_time),
+            -math.expm1(-horizon * crossing))
+
+
 def design(
     network: PowerNetwork, throttle: float, *, voltage: float, horizon: float, risk: float,
     rail: str = 'bus', esr_follows: bool = True, capacitances: tuple[float, float] = (LEAST, MOST),
-    flown: FlownRisk | None = None, assumed: bool = False,
+    sag_error: float = 0.0, flown: FlownRisk | None = None, assumed: bool = False,
 ) -> Design:
     """
     Find the minimum bulk capacitance that meets a brown-out risk (V, s, F).
 
-    flown: the risk of a flight at this voltage and horizon, from which all rows and levers are
-    then computed.
+    sag_error as in `row_of`, for a network without a flight; flown: the risk of a flight at this
+    voltage and horizon, from which all rows and levers are then computed.
     """
     low, high = capacitances
     for name, value, unit in (('voltage', voltage, 'V'), ('horizon', horizon, 's'),
@@ -213,7 +236,7 @@ def design(
         raise ValueError(f'the minimum capacitance must be below the maximum, got {low:g} F and '
                          f'{high:g} F')
 
-    own = row_of(rail_at(network, throttle, rail), voltage, horizon)
+    own = row_of(rail_at(network, throttle, rail), voltage, horizon, sag_error)
 
     def as_flown(row: DesignRow) -> DesignRow:
         if flown is None:
@@ -227,7 +250,7 @@ def design(
 
     def at(capacitance: float) -> DesignRow:
         changed = with_capacitance(network, capacitance, esr_follows)
-        return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon))
+        return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error))
 
     rows = [at(float(c)) for c in np.geomspace(low, high, _GRID)]
     least = None
@@ -244,7 +267,7 @@ def design(
         doubled=at(2.0 * present.capacitance), rows=tuple(rows),
         falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
-        levers=(), assumed=assumed)
+        levers=(), sag_error=sag_error, assumed=assumed)
     return replace(found, levers=_levers(found, at, flown))
 
 
@@ -254,7 +277,8 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
 
     def risk(changed: PowerNetwork, u: float = throttle) -> float:
         try:
-            return row_of(rail_at(changed, u, found.rail), found.voltage, found.horizon).risk
+            return row_of(rail_at(changed, u, found.rail), found.voltage, found.horizon,
+                          found.sag_error).risk
         except ValueError:
             # The battery cannot supply the load.
             return 1.0

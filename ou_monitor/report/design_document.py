@@ -74,7 +74,7 @@ def _time(value: float) -> str:
 
 
 def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed: bool,
-                origin: str, as_flown: bool) -> str:
+                origin: str) -> str:
     """Return in words what was taken from a flight, and what is missing (origin: of the cells)."""
     cells = f'{counted(network.cells, "cell")} ({origin})' if network.cells else (
         'taken as a rail, whose regulator is a constant voltage behind a resistance')
@@ -97,9 +97,7 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
                       network.battery_resistance, flight.resistance) else '.'))
             + ('' if math.isfinite(flight.alpha) else ' The flight shows no relaxation: alpha of '
                f'slow noise is assumed to be {number(network.flutter_rate)} 1/s.')
-            + (' The risks include the errors of voltage and sag, and are computed as in analyze, '
-               'with the sag and noise of each row.' if as_flown else
-               ' The risks are those of the network, without the errors of voltage and sag.')
-            + regulator
+            + ' The risks include the errors of voltage and sag, and are computed as in analyze, '
+            'with the sag and noise of each row.' + regulator
             + ' A recording shows neither bulk capacitor nor ESR: state those of the recorded '
             'craft (--set bulk_capacitance=470uF).')

@@ -9,9 +9,11 @@ from command_line import answer, failure, write_csv
 import numpy as np
 from ou_monitor.cli.commands import quantity
 from ou_monitor.cli.main import main
-from ou_monitor.paper.network import PowerNetwork
+from ou_monitor.paper.design import row_of
+from ou_monitor.paper.network import PowerNetwork, rail_at
 from ou_monitor.recordings.read import read_recording
 import pytest
+from scipy import stats
 
 QUESTION = ['design', '--risk', '1e-3', '--throttle', '0.4']
 
@@ -378,3 +380,20 @@ def test_outliers_are_left_out_as_in_analyze(flight, tmp_path, capsys):
     found = asked(capsys, '--from', path, '--voltage', 14.9, '--risk', 0.01)
     supply = answer(capsys, 'analyze', path, '--brownout-voltage', 14.9)['supply']
     assert supply['dips']['count'] > 3 and found['supply'] == supply
+
+
+def test_the_error_of_the_sag_counts():
+    network = PowerNetwork(switching_scale=0.0, flutter=0.0)
+    sag = row_of(rail_at(network, 0.4), 1.0, 5.0).sag
+    mean = row_of(rail_at(network, 0.4), 1.0, 5.0).mean
+    for share, errors in ((0.1, 3.0), (0.2, 1.0), (0.05, -1.0)):
+        row = row_of(rail_at(network, 0.4), mean - errors * share * sag, 5.0, share)
+        quiet = rail_at(network, 0.4).var_inf
+        # Its noise, if any, is small beside the error.
+        assert quiet < (0.05 * share * sag) ** 2
+        assert row.risk == pytest.approx(stats.norm.sf(errors), rel=0.05)
+    # Without noise the integral is empty, and with it the risks agree where the error is small.
+    noisy = PowerNetwork()
+    plain, near = (row_of(rail_at(noisy, 0.3), 19.8, 5.0, error) for error in (0.0, 1e-4))
+    assert near.risk == pytest.approx(plain.risk, rel=0.02)
+    assert near.mean_time == pytest.approx(plain.mean_time, rel=0.02)
