@@ -133,7 +133,11 @@ def write_text(text: str, target: str | Path, force: bool = False) -> None:
         write_whole(path, content, over=force)
         return
     try:
-        path.write_bytes(content)
+        # Without blocking, so that a FIFO without a reader fails instead of waiting for one.
+        with open(path, 'wb', opener=lambda name, flags: os.open(
+                name, os.O_WRONLY | os.O_NONBLOCK)) as file:
+            os.set_blocking(file.fileno(), True)
+            file.write(content)
     except OSError as error:
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
 
@@ -164,6 +168,12 @@ def check_paths(inputs: Mapping[str, str | Path | None],
             if _is_same_file(target, earlier):
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
+            inner, outer = sorted((_real(target), _real(earlier)),
+                                  key=lambda path: -len(path.parts))
+            if outer in inner.parents and (
+                    not outer.is_dir() or (outer / 'metadata.yaml').exists()):
+                raise InputError(f"{other} and {name}: '{inner.name}' would lie in the bag "
+                                 f"'{outer.name}': give it a name elsewhere")
     for name, target in written:
         # `check_writable` reports a folder in place of a file.
         if os.path.lexists(target) and not target.is_dir() and not force:

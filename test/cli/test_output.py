@@ -142,12 +142,17 @@ def test_a_fifo_is_no_bag_and_hangs_nothing(tmp_path):
     with pytest.raises(InputError, match='neither a file nor a folder'):
         with output.replacing(fifo, force=True):
             pytest.fail('it is not replaced')
+    with pytest.raises(InputError, match='cannot write'):
+        output.write_text('nobody reads this', fifo, force=True)
 
 
-def test_an_output_around_an_input_is_refused(tmp_path):
-    log = tmp_path / 'logs' / 'log.csv'
+def test_an_output_within_another_or_around_an_input_is_refused(tmp_path):
+    bag, log = bag_folder(tmp_path / 'bag', 'old'), tmp_path / 'logs' / 'log.csv'
     log.parent.mkdir()
     log.write_text('x')
+    for inner in ('bag_0.mcap', 'metadata.yaml', 'deep/x.json'):
+        with pytest.raises(InputError, match='would lie in the bag'):
+            output.check_paths({}, {'--output': bag, '--json': bag / inner}, force=True)
     with pytest.raises(InputError, match='would overwrite LOG'):
         output.check_paths({'LOG': log}, {'OUT': log.parent}, force=True)
 
