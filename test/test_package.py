@@ -272,15 +272,6 @@ def test_pip_installs_the_message_descriptions(offline, tmp_path):
     assert done.stdout.split() == sorted(path.stem for path in ROOT.glob('msg_config/*.yaml'))
 
 
-def test_pip_installs_the_mark_of_a_typed_package(offline, tmp_path):
-    """A type checker of a user's project reads the annotations only where py.typed is."""
-    code = 'from importlib.resources import files; print(files("ou_monitor") / "py.typed")'
-    done = run(offline / 'python', '-c', code, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    marker = Path(done.stdout.strip())
-    assert marker.is_file() and marker.is_relative_to(offline.parent)
-
-
 def test_changelog_is_of_this_version():
     released = list(get_changelog_from_path(str(ROOT)).foreach_version(reverse=True))
     version = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')

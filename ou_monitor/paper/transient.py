@@ -21,7 +21,7 @@ from ou_monitor.paper.published import Printed, Range, Row
 from ou_monitor.records import FloatArray
 from ou_monitor.text import Z95
 from scipy import stats
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import brentq, curve_fit
 
 WHERE = 'Fig. 5'
 # Corner of the AC coupling of many hand-held oscilloscopes, Hz.
@@ -71,6 +71,11 @@ def fit_log_line(time: FloatArray, value: FloatArray) -> LogLine:
                    float(stats.t.ppf(0.975, time.size - 2)))
 
 
+def decay(time: FloatArray, start: float, alpha: float, offset: float = 0.0) -> FloatArray:
+    """Return an exponential with the rate alpha, 1/s, and an offset."""
+    return np.asarray(start * np.exp(-alpha * time) + offset)
+
+
 @dataclass(frozen=True, eq=False)
 class DecayFit:
     """start exp(-alpha t) + offset by least squares of the voltages."""
@@ -82,8 +87,7 @@ class DecayFit:
 
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the curve at times, s."""
-        start, alpha, *offset = self.parameters
-        return np.asarray(start * np.exp(-alpha * time) + (offset[0] if offset else 0.0))
+        return decay(time, *self.parameters)
 
     def band(self, k: int) -> Range:
         """Return the 95 % interval of a parameter."""
@@ -94,18 +98,13 @@ class DecayFit:
 def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> DecayFit:
     """Fit an exponential, with or without a constant offset, to the voltages."""
     line = fit_log_line(time, value)
-    first = [line.start, line.alpha] + ([0.0] if offset else [])
-
-    def misfit(p: FloatArray) -> FloatArray:
-        return np.asarray(p[0] * np.exp(-p[1] * time) + (p[2] if offset else 0.0) - value)
-
+    first = [line.start, line.alpha, 0.0][:3 if offset else 2]
     scale = [line.start, line.alpha, 0.1 * line.start][:len(first)]
-    found = least_squares(misfit, first, x_scale=scale, xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    free = time.size - len(first)
-    rss = 2.0 * float(found.cost)
-    covariance = np.linalg.inv(found.jac.T @ found.jac) * rss / free
-    return DecayFit(np.asarray(found.x), np.sqrt(np.diag(covariance)), rss,
-                    float(stats.t.ppf(0.975, free)))
+    found, covariance = curve_fit(decay, time, value, first, method='trf', x_scale=scale,
+                                  xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    rss = float(np.sum((decay(time, *found) - value) ** 2))
+    return DecayFit(found, np.sqrt(np.diag(covariance)), rss,
+                    float(stats.t.ppf(0.975, time.size - len(first))))
 
 
 # The paper's own fit: ln|U| over 0..35 ms.

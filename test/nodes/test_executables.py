@@ -160,18 +160,6 @@ def test_the_throttles_package_is_not_needed(world):
     assert process.stop() == 0
 
 
-@pytest.mark.parametrize('name', ['estimator', 'adaptive_filter', 'replay'])
-def test_without_ros_one_line_says_so(tmp_path, name):
-    """An rclpy that cannot be imported stands for none."""
-    (tmp_path / 'rclpy.py').write_text("raise ImportError('No module named rclpy')\n")
-    path = os.pathsep.join([str(tmp_path), str(ROOT)])
-    done = subprocess.run(
-        [sys.executable, '-m', 'ou_monitor.nodes', name, 'x.mcap'], cwd=tmp_path, text=True,
-        capture_output=True, env={**os.environ, 'PYTHONPATH': path}, check=False)
-    assert done.returncode == 2
-    assert done.stderr.count('\n') == 1 and 'ROS 2 is not installed' in done.stderr
-
-
 def test_the_nodes_have_one_thread_of_blas():
     """More of them on one core wait for one another; what the user says stands."""
     code = ('import ou_monitor.nodes.run, os, sys; assert "numpy" not in sys.modules; '
