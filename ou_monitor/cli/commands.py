@@ -246,7 +246,6 @@ class Command:
     epilog: str = ''  # Text before the examples at the end of its help
 
     def add_to(self, subparsers: Any) -> None:
-        """Add the parser of this command."""
         parser: argparse.ArgumentParser = subparsers.add_parser(
             self.name, allow_abbrev=False, help=self.job.replace('%', '%%'),
             description=self.description, epilog='\n'.join([
@@ -261,7 +260,6 @@ class Command:
         parser.set_defaults(run=self.run)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Run the command; return the exit status."""
         module, _, name = self.module.partition(':')
         function: Callable[[argparse.Namespace], int] = getattr(
             import_module(module), name or 'run')

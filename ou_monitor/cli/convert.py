@@ -13,7 +13,6 @@ from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert a log, or list its series."""
     if args.list and args.out is not None:
         raise InputError(f"--list writes no bag: leave '{args.out}' out")
     # Check the outputs first: reading the log may take long.

@@ -40,7 +40,6 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
-        """Report bad arguments in one line and exit with status 2."""
         self.exit(BAD_INPUT, f"{self.prog}: {message} (see '{self.prog} --help')\n")
 
 

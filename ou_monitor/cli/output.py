@@ -150,7 +150,6 @@ def given(text: str) -> str:
 
 
 def path_argument(text: str) -> Path:
-    """Return a path given as an argument."""
     return Path(given(text))
 
 

@@ -23,14 +23,12 @@ if TYPE_CHECKING:
 
 
 def analyze(args: argparse.Namespace) -> int:
-    """Run `analyze`: the facts of a supply, and the noise of each load level."""
     given = _bench_arguments(args, 'levels', 'window', 'brownout_horizon')
     output.deliver(args, _read_and_run(args, 'analyzing', bench.analyze, given)[1])
     return 0
 
 
 def compare(args: argparse.Namespace) -> int:
-    """Run `compare`: a recording beside simulations of it."""
     from ou_monitor.recordings.model_file import read_model
 
     given = _bench_arguments(args, 'fit_until', 'seeds', 'seed')
@@ -41,7 +39,6 @@ def compare(args: argparse.Namespace) -> int:
 
 
 def coupling(args: argparse.Namespace) -> int:
-    """Run `coupling`: supply noise in a signal."""
     given = _bench_arguments(args, 'band', 'level')
     recording, series = read_given(args, args.signal)
     assert series is not None
@@ -56,7 +53,6 @@ def coupling(args: argparse.Namespace) -> int:
 
 
 def discover(args: argparse.Namespace) -> int:
-    """Run `discover`: what the simulation gets wrong, why, and the gain."""
     given = _bench_arguments(args, 'seed')
     recording, finding = _read_and_run(args, 'discovering', bench.discover, given)
     why = finding.unsaved
@@ -72,7 +68,6 @@ def discover(args: argparse.Namespace) -> int:
 
 
 def reproduce(args: argparse.Namespace) -> int:
-    """Run `reproduce`: every number of the paper, recomputed, with a verdict."""
     check_outputs(args)
     with Progress('recomputing') as progress:
         found = bench.reproduce(seed=args.seed, progress=progress)

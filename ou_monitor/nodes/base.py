@@ -155,12 +155,10 @@ class MonitorNode(Node):
         self._at_stop.append(close)
 
     def destroy_node(self) -> None:
-        """Stop, and end the node."""
         self.stop()
         super().destroy_node()
 
     def values(self) -> dict[str, Any]:
-        """Return the present parameters."""
         return {name: self.get_parameter(name).value for name in self._changeable | self._fixed}
 
     def check(self, values: Mapping[str, Any]) -> None:

@@ -72,7 +72,6 @@ class EstimatorNode(MonitorNode):
         super().__init__(name, managed=managed)
 
     def start(self) -> None:
-        """Begin without data, except for a latched flag."""
         sys.setswitchinterval(SWITCH)
         values = self.values()
         settings = _settings(values)
@@ -130,7 +129,6 @@ class EstimatorNode(MonitorNode):
             self._monitor.restart(error)
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise `ValueError` when the parameters contradict each other."""
         path = _settings(values).model_file
         self._models.check(path, self._keep_working)
 
@@ -155,7 +153,6 @@ class EstimatorNode(MonitorNode):
     # -- sources of the input
 
     def _watch(self) -> None:
-        """Check the publishers, 5 times a second."""
         self._stamper.follow()
         self._watched.look(self._inputs.get('voltage'))
         if self._arrived.age is None and not self._sources.problems['voltage']:
@@ -344,7 +341,6 @@ class EstimatorNode(MonitorNode):
         return report, level, summary
 
     def _notes(self) -> list[str]:
-        """Return the notes that are added to any summary."""
         notes = []
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples enters the estimate; all '
@@ -364,7 +360,6 @@ class EstimatorNode(MonitorNode):
 
     @property
     def _voltage(self) -> Source:
-        """Return the source of the voltage, opened or awaited."""
         return self._sources.opened.get('voltage', self._sources.sources['voltage'])
 
     @property
@@ -411,5 +406,4 @@ class EstimatorNode(MonitorNode):
 
 
 def _settings(values: Mapping[str, Any]) -> MonitorSettings:
-    """Return the settings of the monitor; the other parameters are the node's."""
     return monitor_settings({p.name: values[p.name] for p in ESTIMATOR_PARAMETERS})

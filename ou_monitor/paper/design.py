@@ -124,7 +124,6 @@ class Lever:
     least: float
 
     def words(self, value: float) -> str:
-        """Return a value as shown."""
         return number(value) if self.unit else f'{value:g}'
 
 
@@ -369,7 +368,6 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
 
 
 def answer(result: Design) -> str:
-    """Return the answer in words."""
     present, least = result.present, result.least
     if result.verdict is DesignVerdict.ENOUGH:
         also = '' if least is None else f' {_uf(least)} or more meets the target.'
@@ -441,7 +439,6 @@ def _uf(row: DesignRow) -> str:
 
 
 def remarks(result: Design) -> list[str]:
-    """Return further remarks."""
     return [] if result.falls else [
         'More capacitance does not always lower the risk here (ESR): choose a value from the '
         'table.']

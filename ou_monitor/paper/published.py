@@ -116,7 +116,6 @@ class Row:
 
     @property
     def verdict(self) -> RowVerdict:
-        """Return the verdict from the ranges."""
         if _overlap(self.printed.ends, self.interval):
             return RowVerdict.AGREES
         # Vary the inputs of both numbers within their rounding.

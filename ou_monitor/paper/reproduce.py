@@ -69,7 +69,6 @@ def tally(rows: Sequence[Row]) -> str:
 
 def eight_points(rows: Sequence[Row], crests: Crests,
                  found: list[JumpCrest]) -> tuple[Point, ...]:
-    """Return the eight points."""
     texts = (
         ('Factor 2 in formula (6)', _factor(rows)),
         ('alpha and the AC coupling of the oscilloscope', _coupling(rows)),
@@ -301,7 +300,6 @@ def recomputed(row: Row) -> str:
 
 
 def as_data(result: Reproduction) -> dict[str, Any]:
-    """Return a reproduction as plain data."""
     return {
         'headline': headline(result),
         'seed': result.seed,

@@ -213,7 +213,6 @@ class Generator:
 
     @property
     def size(self) -> int:
-        """Return the number of states n."""
         return len(self.q)
 
     @property

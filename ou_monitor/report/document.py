@@ -85,7 +85,6 @@ class Pair:
 
     @classmethod
     def two_by_two(cls, figures: Sequence[Figure]) -> list[Pair]:
-        """Return figures in pairs."""
         return [cls(figures[k:k + 2]) for k in range(0, len(figures), 2)]
 
 

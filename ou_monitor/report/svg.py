@@ -247,7 +247,6 @@ class Plot:
             c.high for c in self.curves if c.high is not None], self.log_y)
 
     def svg(self) -> str:
-        """Return the drawing."""
         right, bottom = self.width - _RIGHT, self.height - _BOTTOM
         x = Scale(*self.x_range, _LEFT, right, self.log_x)
         y = Scale(*self.y_range, bottom, self._top, self.log_y)

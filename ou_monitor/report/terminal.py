@@ -23,7 +23,6 @@ def columns() -> int:
 
 
 def terminal(document: Document) -> str:
-    """Return a document as text."""
     parts = [paragraph(document.subject), paragraph(document.headline)]
     return '\n\n'.join(part for part in (*parts, *map(_part, document.parts)) if part)
 
