@@ -14,7 +14,7 @@ from ou_monitor.stream.samples import SampleStream
 import pytest
 
 ROOT = str(Path(ou_monitor.__file__).parent)
-MOST = 26
+MOST = 24
 
 
 def files_of(calls):
