@@ -351,9 +351,9 @@ class _Likelihood:
         # A grid has few rates, and each spectrum is expensive.
         rates, of = np.unique(points[:, 0], return_inverse=True)
         share = 1.0 / (1.0 + np.exp(-points[:, 1:2]))
-        excess = self._cross.ou(np.exp(rates)[:, None]) - 1.0
+        excess = self._cross.bins.ou(np.exp(rates)[:, None]) - 1.0
         return self._cross.cost(
-            1.0 + share * excess[of] + np.exp(points[:, 2:]) / self._cross.walk)[:2]
+            1.0 + share * excess[of] + np.exp(points[:, 2:]) / self._cross.bins.walk)[:2]
 
 
 def _points(*axes: FloatArray) -> FloatArray:

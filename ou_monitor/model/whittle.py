@@ -121,7 +121,7 @@ def absorbed_by(basis: FloatArray) -> FloatArray:
     return np.asarray(np.interp(ABSORBED_AT, np.pi * (np.arange(n + 1) - 0.5) / n, total))
 
 
-class _Bins:
+class SpectrumBins:
     """Bins of the ordinates of stretches of readings; arrays have shape (bins,)."""
 
     def __init__(self, lengths: tuple[int, ...], each_mean: bool) -> None:
@@ -162,8 +162,17 @@ class _Bins:
         # Inverse of the ordinates of a random walk, with a nominal value for the mean (omega 0).
         self.walk = 4.0 * np.sin(0.5 * np.maximum(omega, 0.5 * np.pi / self.size)) ** 2
 
+    def ou(self, a: FloatArray) -> FloatArray:
+        """Return the expected ordinates of an OU of variance 1; a: alpha dt, shape (k, 1)."""
+        # The inverse covariance is (1 - phi)^2 + phi L, whose eigenvectors are the cosines, plus
+        # phi (1 - phi) at both ends, which needs Woodbury's formula.
+        phi, gap = np.exp(-a), -np.expm1(-a)
+        square = gap * gap + phi * self.chord
+        end = self.ends * phi * gap * (1.0 - self.sign * np.exp(-a * self.size)) / (1.0 + phi)
+        return np.asarray(gap * (1.0 + phi) / square * (1.0 - end / square))
 
-_bins = functools.lru_cache(maxsize=8)(_Bins)
+
+_bins = functools.lru_cache(maxsize=8)(SpectrumBins)
 
 
 class CrossSpectrum:
@@ -179,11 +188,11 @@ class CrossSpectrum:
         # readings.
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
-        self._q, self._bins = q, _bins(tuple(lengths), q == 1)
-        self.walk, count = self._bins.walk, self._bins.count
+        self._q, self.bins = q, _bins(tuple(lengths), q == 1)
+        count = self.bins.count
         parts = np.split(rows, np.cumsum(lengths)[:-1], axis=1)
         cross, gone = np.zeros((count.size, q, q)), np.zeros(count.size)
-        for k, begin, ends in self._bins.stretches:
+        for k, begin, ends in self.bins.stretches:
             C = cosines(parts[k])
             if q == 1:
                 C[:, 0] = 0.0
@@ -204,16 +213,6 @@ class CrossSpectrum:
     def size(self) -> int:
         """Return the number of values of one spectrum."""
         return max(self._cross.shape)
-
-    def ou(self, a: FloatArray) -> FloatArray:
-        """Return the expected ordinates of an OU of variance 1; a: alpha dt, shape (k, 1)."""
-        # The inverse covariance is (1 - phi)^2 + phi L, whose eigenvectors are the cosines, plus
-        # phi (1 - phi) at both ends, which needs Woodbury's formula.
-        phi, gap = np.exp(-a), -np.expm1(-a)
-        bins = self._bins
-        square = gap * gap + phi * bins.chord
-        end = bins.ends * phi * gap * (1.0 - bins.sign * np.exp(-a * bins.size)) / (1.0 + phi)
-        return np.asarray(gap * (1.0 + phi) / square * (1.0 - end / square))
 
     def cost(self, S: FloatArray, used: int | None = None
              ) -> tuple[FloatArray, FloatArray, FloatArray]:

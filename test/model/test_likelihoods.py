@@ -159,7 +159,7 @@ def test_ordinates_expected_of_an_ou_are_exact(n, a):
     D = dct(np.eye(n), axis=0, norm='ortho')
     spectrum = CrossSpectrum(np.ones((2, n)), [n])
     np.testing.assert_allclose(
-        spectrum.ou(np.array([[a]]))[0],
+        spectrum.bins.ou(np.array([[a]]))[0],
         np.diagonal(D @ toeplitz(np.exp(-a * np.arange(n))) @ D.T), rtol=1e-10)
 
 
@@ -169,7 +169,7 @@ def test_ordinates_of_a_random_walk_are_exact():
     D = dct(np.eye(n), axis=0, norm='ortho')
     K = D @ np.minimum(*np.indices((n, n))) @ D.T
     np.testing.assert_allclose(
-        1.0 / CrossSpectrum(np.ones((2, n)), [n]).walk[1:], np.diagonal(K)[1:], rtol=1e-9)
+        1.0 / CrossSpectrum(np.ones((2, n)), [n]).bins.walk[1:], np.diagonal(K)[1:], rtol=1e-9)
 
 
 @pytest.mark.parametrize('m', [1, 4])

@@ -20,13 +20,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import enum
+import functools
 import math
 from typing import Protocol
 
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.model.ou_fit import stretches
-from ou_monitor.model.whittle import CrossSpectrum
+from ou_monitor.model.whittle import CrossSpectrum, SpectrumBins
 from ou_monitor.records import FloatArray
 
 # Minimum variance of a combination of load variables, relative to the largest; with less, the
@@ -168,31 +169,39 @@ class SpectralLikelihood:
         self._cross = CrossSpectrum(rows, lengths)
         self.low, self.high = _ends(self.n)
 
-    def _spectra(self, log_a: FloatArray, z: FloatArray) -> FloatArray:
-        """Return the spectra of OU and noise in units of sigma^2, shape (k, bins)."""
-        gamma = np.array([arma.block_autocovariance(math.exp(x), self.m) for x in log_a.tolist()])
-        a = np.exp(log_a)
-        # The covariance of two block means is that of an OU of variance `size`; the variance of
-        # one block mean is less.
-        size = gamma[:, 1] * np.exp(a)
-        white = gamma[:, 0] - size + _SMALL * np.expm1(z)
-        return np.asarray(self.step * (
-            size[:, None] * self._cross.ou(a[:, None]) + white[:, None]))
-
     def at(self, log_a: float, z: float, used: int) -> _Point:
         """Return the likelihood with the first `used` regressors; see `StampLikelihood.at`."""
-        value, scale, gram = self._cross.cost(self._spectra(
-            log_a + _HAIR * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),
+        value, scale, gram = self._cross.cost(self.step * _spectra(
+            self._cross.bins, self.m, log_a + _HAIR * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),
             z + _HAIR * np.array([0.0, 0.0, 0.0, 1.0, -1.0])), used)
         return _Point(float(value[0]), (value[1::2] - value[2::2]) / (2.0 * _HAIR),
                       float(scale[0]), gram[0])
 
     def start(self, used: int) -> FloatArray:
         """Return the best ln a and z of a grid."""
-        log_a, z = (x.ravel() for x in np.meshgrid(*(
-            np.linspace(*ends) for ends in zip(self.low, self.high, _GRID)), indexing='ij'))
-        k = int(np.argmin(self._cross.cost(self._spectra(log_a, z), used)[0]))
-        return np.array([log_a[k], z[k]])
+        places, spectra = _grid(self._cross.bins, self.m, self.n)
+        # The cost does not depend on the scale of a spectrum.
+        found: FloatArray = places[int(np.argmin(self._cross.cost(spectra, used)[0]))]
+        return found
+
+
+def _spectra(bins: SpectrumBins, m: int, log_a: FloatArray, z: FloatArray) -> FloatArray:
+    """Return the spectra of OU and noise in units of sigma^2 times the step, shape (k, bins)."""
+    gamma = np.array([arma.block_autocovariance(math.exp(x), m) for x in log_a.tolist()])
+    a = np.exp(log_a)
+    # The covariance of two block means is that of an OU of variance `size`; the variance of one
+    # block mean is less.
+    size = gamma[:, 1] * np.exp(a)
+    white = gamma[:, 0] - size + _SMALL * np.expm1(z)
+    return np.asarray(size[:, None] * bins.ou(a[:, None]) + white[:, None])
+
+
+@functools.lru_cache(maxsize=4)
+def _grid(bins: SpectrumBins, m: int, n: int) -> tuple[FloatArray, FloatArray]:
+    """Return ln a and z at the points of the initial grid, shape (k, 2), and their spectra."""
+    log_a, z = (x.ravel() for x in np.meshgrid(*(
+        np.linspace(*ends) for ends in zip(*_ends(n), _GRID)), indexing='ij'))
+    return np.stack([log_a, z], axis=1), _spectra(bins, m, log_a, z)
 
 
 class StampLikelihood:
