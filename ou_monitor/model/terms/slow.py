@@ -132,8 +132,6 @@ class SecondRelaxation(Term):
 # Octaves between poles, for simulations (before the low-pass, 1/f within 0.2 %) and for fits
 # (within 6 %).
 _FINE, _COARSE = 0.5, 3.0
-# Relaxation times in a step above which the previous state is negligible (exp(-20) = 2e-9).
-_FORGOTTEN = 20.0
 # Last pole, and corner of the low-pass, relative to the upper frequency.  The low-pass removes
 # 1.5 % at the upper frequency, and most of the noise above the last pole.
 _LADDER, _CORNER = 4.5, 8.0
@@ -247,14 +245,6 @@ class FlickerNoise(Term):
         # Most recordings have only a few different steps.
         step, which = np.unique(s.step, return_inverse=True)
         rate, finite = self.corner, np.isfinite(step)
-        fast = poles * float(step[finite].min(initial=math.inf)) > _FORGOTTEN
-        if fast[1:].any():
-            # One state represents all poles that have no memory from sample to sample.
-            seen = variances * rate / (rate + poles)
-            first = int(np.argmax(fast))
-            variances[first] *= float(seen[fast].sum() / seen[first])
-            poles, variances = (x[~fast | (np.arange(x.size) == first)]
-                                for x in (poles, variances))
         last = poles.size
         f = np.zeros((step.size, last + 1, last + 1))
         q = np.zeros_like(f)
