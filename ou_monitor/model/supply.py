@@ -22,11 +22,6 @@ from ou_monitor.records import FloatArray
 # of all terms in the processor's caches.
 SEGMENT = 15_000
 
-# Size of an array that is allocated and freed once, after which the GNU allocator keeps freed
-# memory for reuse.  Otherwise each segment would request its memory from the system page by page,
-# which can take longer than the arithmetic.
-_KEPT = 2**18
-
 # Relative difference below which steps count as equal, because stamps are rounded.
 _ROUNDING = 1e-6
 
@@ -154,10 +149,7 @@ class Simulation:
                                  'one is a current' if model.full_current else
                                  "the model has no entry 'load', which the charge needs")
             self.discharge = Discharge(model.load, model.ou.u0, charge)
-        np.empty(_KEPT)
         self._effects = self._in_order(rng)
-        # Without a `DRIVE` term, alpha, sigma, power and push are broadcast from constants.
-        self._driven = any(term.STAGE is Stage.DRIVE for term in model.terms)
         self._origin = math.nan
         self._last = -math.inf
 
@@ -237,13 +229,10 @@ class Simulation:
 
     def _segment(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Segment:
         ou, n = self._model.ou, stamps.size
-
-        def of(value: float) -> FloatArray:
-            return np.full(n, value) if self._driven else np.broadcast_to(value, n)
-
         return Segment(
             t=stamps, at=stamps, step=step, throttle=throttle, origin=self._origin,
-            alpha=of(ou.alpha), sigma=of(ou.sigma), power=of(1.0), push=of(0.0), bend=(0.0, 0.0),
+            alpha=np.full(n, ou.alpha), sigma=np.full(n, ou.sigma), power=np.ones(n),
+            push=np.zeros(n), bend=(0.0, 0.0),
             x=np.broadcast_to(0.0, n), level=np.full(n, ou.u0),
             noise=np.broadcast_to(1.0, n), voltage=np.broadcast_to(0.0, n))
 

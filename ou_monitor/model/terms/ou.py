@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.ou import first_order, steady
+from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.term import (
     Effect, LawFit, log_normal, parameter, Role, Segment, Stage, Term, View)
 from ou_monitor.records import FloatArray
@@ -49,40 +49,13 @@ class OU(Term):
             nonlocal before
             kicks = rng.standard_normal(s.t.size)
             if s.bend == (0.0, 0.0):
-                phi, std = _transition(s)
-                kicks *= std
-                if not (steady(s.push) and s.push[0] == 0.0):
-                    kicks += s.push
-                s.x = first_order(phi, kicks, before)
+                kicks = kicks * np.sqrt(s.added * s.power) + s.push
+                s.x = first_order(s.phi, kicks, before)
             else:
                 s.x = _nonlinear(s, kicks, before, parts)
             before = float(s.x[-1])
 
         return effect
-
-
-def _transition(s: Segment) -> tuple[FloatArray, FloatArray]:
-    """Return the decay of the state in each step, and the deviation of the added noise, V."""
-    n = s.step.size
-    # If all steps and alphas are equal, two values suffice: one for the first sample, which may
-    # follow a gap, and one for the others.
-    some = slice(2) if steady(s.step[1:]) and steady(s.alpha[1:]) else slice(n)
-    alpha, step = s.alpha[some], s.step[some]
-    phi = _extended(n, np.exp(-alpha * step))
-    std = _extended(n, np.sqrt(-np.expm1(-2.0 * alpha * step) / (2.0 * alpha)))
-    std *= s.sigma
-    if not (steady(s.power) and s.power[0] == 1.0):
-        std *= np.sqrt(s.power)
-    return phi, std
-
-
-def _extended(n: int, values: FloatArray) -> FloatArray:
-    """Return n values: the given ones, then repeats of the last one."""
-    if values.size == n:
-        return values
-    filled = np.full(n, values[-1])
-    filled[:values.size] = values
-    return filled
 
 
 def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator

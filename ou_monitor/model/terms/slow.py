@@ -208,7 +208,7 @@ class FlickerNoise(Term):
                 phi = np.exp(-pole * s.step)
                 e = std[k] * np.sqrt(-np.expm1(-2.0 * pole * s.step))
                 x = first_order(phi, e * sources[k].standard_normal(s.t.size), before[k])
-                of_old, of_new, left = _bridge(float(pole), rate, step)
+                of_old, of_new, left = bridge(pole, rate, step)
                 driven += of_old * np.concatenate(([before[k]], x[:-1])) + of_new * x
                 spread += 2.0 * pole * std[k] ** 2 * left
                 before[k] = x[-1]
@@ -253,21 +253,13 @@ class FlickerNoise(Term):
         for k, (pole, variance, of_long) in enumerate(zip(poles, variances, share, strict=True)):
             phi = np.exp(-pole * step)
             added = variance * -np.expm1(-2.0 * pole * step)
-            of_old, of_new, left = _bridge(pole, rate, np.where(finite, step, 0.0))
+            of_old, of_new, left = bridge(pole, rate, np.where(finite, step, 0.0))
             f[:, k, k], q[:, k, k] = phi, added
             f[:, last, k] = of_old + of_new * phi
             q[:, k, last] = q[:, last, k] = np.where(finite, of_new * added, of_long * variance)
             q[:, last, last] += np.where(
                 finite, of_new * of_new * added + 2.0 * pole * variance * left, of_long * variance)
         return f[which], q[which], np.eye(last + 1)[last]
-
-
-def _bridge(pole: float, rate: float, step: FloatArray
-            ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return `bridge` for one pole, computed once for equal steps."""
-    some, which = np.unique(step, return_inverse=True)
-    old, new, left = bridge(np.full(some.size, pole), rate, some)
-    return old[which], new[which], left[which]
 
 
 def _sum(low: float, high: float, octaves: float) -> tuple[FloatArray, FloatArray]:
@@ -374,7 +366,7 @@ class ACCoupling(Term):
         return shown
 
 
-def bridge(alpha: FloatArray, rate: float, step: FloatArray
+def bridge(alpha: FloatArray | float, rate: float, step: FloatArray
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return start, end and spread of one step of a low-passed OU, given the OU at both ends."""
     # l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z, with l the
