@@ -263,26 +263,15 @@ def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> Flo
     return _inverse(p)
 
 
-# Number of samples whose matrices fit into the caches.
-_AT_ONCE = 1024
-
-
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
     d, n = diagonal.shape[0], diagonal.shape[2]
-    # Stored in LAPACK's order, column by column.  Write it in segments, because writing an element
-    # for all samples at once would cause cache misses.
+    # Stored in LAPACK's order, column by column.
     band = np.zeros((n, d, 2 * d))
-    inside = [(i, j) for j in range(d) for i in range(j, d)]
-    across = np.argwhere(_pattern(below)).tolist()
-    for begin in range(0, n, _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
-        rows = band[part]
-        for i, j in inside:
-            rows[:, j, i - j] = diagonal[i, j, part]
-        rows = band[begin:min(begin + _AT_ONCE, n - 1)]
-        for i, j in across:
-            rows[:, j, d + i - j] = below[i, j, part]
+    for i, j in np.argwhere(np.tri(d)).tolist():
+        band[:, j, i - j] = diagonal[i, j]
+    for i, j in np.argwhere(_pattern(below)).tolist():
+        band[:-1, j, d + i - j] = below[i, j]
     return band.reshape(n * d, 2 * d).T
 
 
