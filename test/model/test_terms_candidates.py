@@ -5,12 +5,12 @@ from itertools import combinations
 import math
 
 import numpy as np
-from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
+from ou_monitor.model.hidden_chain import forward, log_likelihood
 from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.load_response import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
-    _SLOW_AHEAD, _slow_levels, calm_levels, chain_of, rates_between, RegimeSwitching, relaxing,
-    Scores, stationary_law, step_chances, without_levels)
+    _SLOW_AHEAD, _slow_levels, chain_of, rates_between, RegimeSwitching, relaxing, Scores,
+    stationary_law, step_chances, without_levels)
 from ou_monitor.model.terms.shocks import _best_runs, _mixture, Jumps
 from ou_monitor.model.terms.term import curvature_se, normal_scores, refine, View
 from ou_monitor.model.terms.tones import order_power
@@ -344,19 +344,11 @@ def test_without_white_noise_nothing_is_behind():
     view = filtered(drawn(0.4, 1.0, 4)[0], 1e3 * WHITE)
     x = np.array([0.0, 0.0, 4.0, 0.0, 0.0])
     assert not Scores.of(view).following(x, 1.0).followed.any()
-    assert calm_levels(view, slice(0, N), 0.2, np.zeros(1)) is None
 
 
-def test_levels_that_the_filter_followed_are_found():
+def test_the_ou_without_levels_is_fitted_again():
     voltage, levels = drawn(0.4, 1.0, 5)
     view = filtered(voltage, 5.0 * DRIVE)
-    start = calm_levels(view, slice(0, N), float(voltage.std()), np.array([0.7]))
-    assert start is not None
-    x, calm = start.x, start.view
-    assert x[2] * math.sqrt(calm.variance[0]) == pytest.approx(0.4, rel=0.4)
-    chain = chain_of(Scores.of(calm).following(x, start.at_once), x, start.at_once)[0]
-    found = smoothed(*chain)[:, 1] > 0.5
-    assert np.mean(found == (levels > 0.0)) > 0.94
     again = without_levels(view, levels)
     # The OU and the noise that are there: one-step variance within a fifth.
     true = filtered(voltage, DRIVE)

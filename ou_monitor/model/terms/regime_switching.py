@@ -33,9 +33,6 @@ _MEDIAN = 0.6745
 _ALL, NO_LEVEL = 0.98, 0.2
 # Minimum correlation of adjacent residuals to fit an OU to the voltage without levels.
 _LEAST = 1e-3
-# Starting points: noise of the OU relative to the fit without levels, and heights of the levels
-# relative to the spread of the residual.
-_CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
 def rates_between(up: float, down: float, states: int) -> FloatArray:
@@ -204,38 +201,6 @@ class Start:
     at_once: float
     view: View
     to_refine: bool  # Whether to fit again after `without_levels`
-
-
-def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> Start | None:
-    """Return a start for levels beside white noise; None without white noise."""
-    # An `ou` that was fitted without levels has absorbed them, so try OUs with less noise.  Try
-    # heights up to twice the spread, V, at which two levels explain all of the spread.
-    if bool((Scores.of(view).trust == 1.0).all()):
-        return None
-    best: tuple[float, Start] | None = None
-    for share in _CALMER:
-        calm = _with_less_noise(view, share)
-        scores, unit = Scores.of(calm).part(part), math.sqrt(float(np.median(calm.variance)))
-        for height in _HEIGHTS:
-            for rate in rates.tolist():
-                x = np.array([rate, rate, height * spread / unit, 0.0, 0.0])
-                chain = chain_of(scores.following(x, 1.0), x, 1.0)[0]
-                top = log_likelihood(*chain) - 0.5 * float(np.log(calm.variance[part]).sum())
-                if best is None or top > best[0]:
-                    best = top, Start(x, 1.0, calm, True)
-    assert best is not None
-    return best[1]
-
-
-def _with_less_noise(view: View, share: float) -> View:
-    """Return the view for an OU with a share of its noise, and the same white noise."""
-    keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
-    trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
-    variance = float(np.median(view.variance))
-    ahead, white = trust * variance, (1.0 - trust) * variance
-    drive = share * (ahead - keep * keep * ahead * white / (ahead + white))
-    ahead, _ = _settled_variances(keep, drive / (1.0 - keep * keep), white)
-    return _filtered(view, keep, ahead / (ahead + white), ahead + white)
 
 
 def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
@@ -453,11 +418,6 @@ class RegimeSwitching(Term):
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a hidden chain of two or three states."""
         starts = _first_fits(view)
-        spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
-        calm = calm_levels(view, moving(view, min(_SHORT, view.train.stop)), spread,
-                           -np.log(_dwells(view)))
-        if calm is not None:
-            starts.append(calm)
         best: tuple[LawFit, Start] | None = None
         while starts:
             start = starts.pop()
