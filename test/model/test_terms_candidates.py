@@ -9,8 +9,8 @@ from ou_monitor.model.hidden_chain import forward, log_likelihood
 from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.load_response import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
-    _SLOW_AHEAD, _slow_levels, chain_of, rates_between, RegimeSwitching, relaxing, Scores,
-    stationary_law, step_chances, without_levels)
+    chain_of, rates_between, RegimeSwitching, relaxing, Scores, stationary_law, step_chances,
+    without_levels)
 from ou_monitor.model.terms.shocks import _best_runs, _mixture, Jumps
 from ou_monitor.model.terms.term import curvature_se, normal_scores, refine, View
 from ou_monitor.model.terms.tones import order_power
@@ -97,11 +97,6 @@ def flown(levels=0.0, seed=1, n=20_000):
     return View(z=(residual - keep * before) / np.sqrt(variance), variance=variance,
                 phi=np.full(n, keep), state=before, residual=residual, at=0.001 * np.arange(n),
                 step=np.full(n, 0.001), throttle=u, train=slice(0, n))
-
-
-def test_noise_that_follows_throttle_is_no_level():
-    """Two levels in the means of that noise gain no more than their three parameters do."""
-    assert all(_slow_levels(flown(seed=seed))[1] < _SLOW_AHEAD for seed in (1, 2))
 
 
 def test_levels_are_found_beside_noise_that_follows_throttle():

@@ -434,16 +434,11 @@ class RegimeSwitching(Term):
                 best = fit, start
         if best is None or best[1].view is not view:
             return best and best[0]
-        return cls._slow_or_three(view, *best)
+        return cls._two_or_three(view, *best)
 
     @classmethod
-    def _slow_or_three(cls, view: View, two: LawFit, start: Start) -> LawFit:
-        """Return a fit of slow levels or of three states if better than the fit of two states."""
-        if two.power is None:
-            slow, ahead, states = _slow_levels(view)
-            if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
-                # In this view, one OU describes levels and noise; the next fit separates them.
-                return cls._best_fit(view, [slow], 0.0, 1, states) or two
+    def _two_or_three(cls, view: View, two: LawFit, start: Start) -> LawFit:
+        """Return a fit of three states if it is better than the fit of two states."""
         # Let three states differ in what differs between the two states: sigma or level.
         trials = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
@@ -526,61 +521,8 @@ def _counted_rates(before: FloatArray, step: float) -> FloatArray:
     return rates
 
 
-def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
-    """Return a start for levels much slower than the noise, its evidence, and number of levels."""
-    # Means over half a relaxation time are modelled as levels plus first-order noise.  The
-    # correlation of this noise is fitted too, because the correlation of the samples includes the
-    # levels.
-    r = view.residual[view.train]
-    a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))
-    size = max(1, round(0.5 / a))
-    count = r.size // size
-    if count < 100:
-        return None, 0.0, 2
-    mean = r[:count * size].reshape(count, size).mean(axis=1)
-    spread = float(mean.std())
-    if not spread > 0.0:
-        return None, 0.0, 2
-    mean = (mean - mean.mean()) / spread
-    step = size / view.rate
-    # Weight the means, so that noise that depends on throttle is not mistaken for levels.
-    noisy = view.variance[view.train][:count * size].reshape(count, size).mean(axis=1)[1:]
-    noisy /= math.exp(float(np.mean(np.log(noisy))))
-
-    def value(x: FloatArray, states: int) -> float:
-        if max(x[0], x[1]) > _fastest(view) or min(x[0], x[1]) < -6.0 or abs(x[4]) > 4.0:
-            return -math.inf
-        law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
-        keep, state = math.tanh(x[3]), np.arange(states)
-        level = x[2] * (state - law @ state)
-        log = np.empty((states, states, count - 1))
-        for i, j in np.ndindex(states, states):
-            e = mean[1:] - level[j] - keep * (mean[:-1] - level[i])
-            log[i, j] = log_normal(e, 0.0, math.exp(2.0 * x[4]) * noisy)
-        return log_likelihood(log.transpose(2, 0, 1), step_chances(x, step, states), law)
-
-    # Without levels only the correlation and the scale are fitted.
-    keep = float(mean[1:] @ (mean[:-1] / noisy)) / float(mean[:-1] @ (mean[:-1] / noisy))
-    rest = mean[1:] - keep * mean[:-1]
-    least = float(log_normal(rest, 0.0, float(np.mean(rest**2 / noisy)) * noisy).sum())
-    best: tuple[float, FloatArray, int] | None = None
-    for states, level in ((2, 1.7), (3, 1.2)):
-        for dwell in (0.5, 2.0):
-            rate = -math.log(dwell * (states - 1))
-            x, top = climb(lambda x: value(x, states), [rate, rate, level, 0.5 * keep, -0.5],
-                           most=120)
-            top -= _THIRD * (states - 2)
-            if best is None or top > best[0]:
-                best = top, x, states
-    assert best is not None
-    unit = math.sqrt(float(np.median(view.variance)))
-    x = best[1]
-    return np.array([x[0], x[1], x[2] * spread / unit, 0.0, 0.0]), best[0] - least, best[2]
-
-
 # Factors by which the rail may relax faster than in a fit without levels.
 _FASTER = 1.0, 3.0, 9.0
-_SLOW_AHEAD = 8.0  # Minimum evidence for slow levels, nats
 # Number of samples for comparing starts, and for fitting from the best start.
 _SHORT, _LONG = 8000, 30000
 _FASTEST = 30.0  # Maximum rate of switching, 1/s
