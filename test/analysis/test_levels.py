@@ -84,11 +84,6 @@ def test_a_ramp_between_stays_makes_no_level():
     assert len(passed.segments) == 1
 
 
-def test_a_few_seconds_of_full_throttle_are_a_level_of_a_long_flight():
-    t, throttle = profile((0.1, 150), (0.9, 4), (0.4, 146))
-    assert [level.throttle for level in find_levels(t, throttle)] == [0.1, 0.4, 0.9]
-
-
 def test_a_slow_drift_of_throttle_within_a_level_does_not_split_it():
     t, throttle = profile((0.2, 20), (0.5, 20))
     assert len(find_levels(t, throttle + 0.002 * t)) == 2
@@ -134,29 +129,15 @@ def test_bad_levels_are_refused(given, word):
         find_levels(t, throttle, given)
 
 
-def test_short_segments_of_a_ramp_are_no_level():
-    """
-    Five passages of 0.35 s at 30 % between stays of 2 s: no level, though 1.75 s were spent there.
-
-    Asked for, it is one; with one passage of 0.8 s it is found.
-    """
-    pieces = [(0.1, 2.0), (0.3, 0.35), (0.6, 2.0), (0.3, 0.35)] * 2 + [
-        (0.1, 2.0), (0.3, 0.35), (0.6, 2.0)]
-    throttle = np.concatenate([np.full(int(1000 * long), x) for x, long in pieces])
-    t = np.arange(throttle.size) / 1000.0
-    assert [level.throttle for level in find_levels(t, throttle)] == [0.1, 0.6]
-    assert len(find_levels(t, throttle, (0.1, 0.3, 0.6))[1].segments) == 5
-    longer = np.concatenate((throttle, np.full(800, 0.3)))
-    found = find_levels(np.arange(longer.size) / 1000.0, longer)
-    assert [level.throttle for level in found] == [0.1, 0.3, 0.6]
-
-
-def test_a_staircase_of_short_stays_keeps_its_levels():
-    """Where no stay is longer than 0.4 s, the stays are the levels."""
-    throttle = np.tile(np.repeat([0.1, 0.3, 0.6], 400), 5)
-    found = find_levels(np.arange(throttle.size) / 1000.0, throttle)
-    assert [level.throttle for level in found] == [0.1, 0.3, 0.6]
-
-
-def test_an_empty_recording_has_no_levels():
-    assert find_levels(np.zeros(0), np.zeros(0)) == ()
+@pytest.mark.parametrize('parts, given, found', [
+    # A few seconds of full throttle are a level of a long flight.
+    ([(0.1, 150), (0.9, 4), (0.4, 146)], None, [0.1, 0.4, 0.9]),
+    # Where no stay is longer than 0.4 s, the stays are the levels.
+    ([(0.1, 0.4), (0.3, 0.4), (0.6, 0.4)] * 5, None, [0.1, 0.3, 0.6]),
+    # Passages of 0.35 s at 30 % between stays of 2 s are no level, unless asked for, or longer.
+    ([(0.1, 2), (0.3, 0.35), (0.6, 2), (0.3, 0.35)] * 3, None, [0.1, 0.6]),
+    ([(0.1, 2), (0.3, 0.35), (0.6, 2), (0.3, 0.35)] * 3, (0.1, 0.3, 0.6), [0.1, 0.3, 0.6]),
+    ([(0.1, 2), (0.3, 0.35), (0.6, 2), (0.3, 0.35)] * 3 + [(0.3, 0.8)], None, [0.1, 0.3, 0.6]),
+    ([(0.1, 0)], None, [])])
+def test_stays_that_are_levels(parts, given, found):
+    assert [level.throttle for level in find_levels(*profile(*parts), given)] == found

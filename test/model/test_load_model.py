@@ -12,7 +12,6 @@ import pytest
 
 # A pack that does not run down while one looks, at the voltage at which sag is counted.
 STIFF = LoadModel(4, 0.2, charge=charge_at(CELL), endurance=1e12, before=0.0)
-GECKO = ROOT / 'bags/recorded/gecko.csv'
 
 
 def test_the_open_circuit_curve_rises_and_has_an_inverse():
@@ -97,51 +96,40 @@ def test_a_simulated_pack_is_recovered():
     assert 0.05 / np.sqrt(3.0) * 0.9 < fit.noise_std < 0.05 / np.sqrt(2.0) * 1.1
 
 
-def test_no_degenerate_fit_of_the_recorded_flight():
-    """Physical sizes, distinct time constants, and 0.9 of the second half's variance."""
-    flight = recorded(GECKO)
-    t, v, u = flight.t - flight.t[0], flight.voltage, np.clip(flight.throttle, 0.0, 1.0)
-    half = t <= 0.5 * t[-1]
-    # A third of the samples: the answer is slower than that.
-    fit = fit_load(t[half][::3], v[half][::3], u[half][::3])
-    model = fit.model
-    assert fit.condition < 1e3 and model.cells == 4
-    assert float(model.sag(u.max())) < 2.0 * np.ptp(v)
-    assert 4.0 * model.lag < model.fast_time < model.slow_time / 2.0
-    ahead = model.path(t, u)[~half]
-    explained = 1.0 - np.sum((v[~half] - ahead) ** 2) / np.sum((v[~half] - v[~half].mean()) ** 2)
-    assert explained > 0.9
-    assert ahead.max() < v.max() + 0.5 and ahead.min() > v.min() - 0.5
-
-
 @pytest.mark.parametrize('t', [np.array([0.0, 1.0, 1.0]), np.array([0.0, 0.1, 0.2])])
 def test_a_load_that_cannot_be_fitted_is_refused(t):
     with pytest.raises(ValueError, match='s'):
         fit_load(t, np.full(3, 16.0), np.full(3, 0.3))
 
 
-@needs_recordings
-@pytest.mark.parametrize('name', ['cf_solo_large', 'cf_pair_large', 'cf_takeoff'])
-def test_a_fit_stays_physical(name):
+@pytest.mark.parametrize('path', [ROOT / 'bags/recorded/gecko.csv', *(
+    pytest.param(REAL / f'{name}.csv', marks=needs_recordings)
+    for name in ('cf_solo_large', 'cf_pair_large', 'cf_takeoff'))])
+def test_a_fit_stays_physical(path):
     """
     Answers of the size of the swing, distinct times, a condition, and no trend beyond the data.
 
     An extended model of sums of poles held +25.8 V beside -19 V on one of these.
     """
-    flight = recorded(REAL / f'{name}.csv')
+    flight = recorded(path)
     t, v, u = flight.t - flight.t[0], flight.voltage, np.clip(flight.throttle, 0.0, 1.0)
+    # A third of the samples: the answer is slower than that.
     t, v, u = t[::3], v[::3], u[::3]
     half = t <= 0.5 * t[-1]
     fit = fit_load(t[half], v[half], u[half])
     model = fit.model
     swing = float(np.ptp(v))
-    # No part of the answer is larger than what was seen, so none can cancel another.
+    # No part of the answer is much larger than what was seen, so none can cancel another.
     for part in (1.0, model.fast_share, model.slow_share):
         over = float(model.sag(u.max()) - model.sag(u.min()))
         assert 0.0 < part * over / (1.0 + model.fast_share + model.slow_share) < swing
     assert float(model.sag(u.max())) < 0.35 * v.max()
-    assert 10.0 * model.lag < model.fast_time < 0.5 * model.slow_time
+    assert 4.0 * model.lag < model.fast_time < 0.5 * model.slow_time
     assert fit.condition < 1e3 and np.isfinite(fit.covariance).all()
+    if path.stem == 'gecko':
+        left = (v - model.path(t, u))[~half]
+        assert model.cells == 4
+        assert np.sum(left ** 2) < 0.1 * np.sum((v[~half] - v[~half].mean()) ** 2)
     # A minute beyond the data the charge is that of the load: no parabola, no pole runs away.
     beyond = np.concatenate((t, t[-1] + np.arange(0.1, 60.0, 0.1)))
     held = np.concatenate((u, np.full(beyond.size - t.size, float(np.mean(u)))))

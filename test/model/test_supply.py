@@ -70,15 +70,6 @@ def test_all_terms_together_give_finite_samples():
     np.testing.assert_allclose(np.concatenate(parts), whole, rtol=0, atol=1e-9)
 
 
-def test_equal_seeds_give_equal_samples():
-    """The same seed, the same samples; a generator that was used gives others."""
-    rng = np.random.default_rng(5)
-    first, second = supply().simulate(T, rng), supply().simulate(T, rng)
-    np.testing.assert_array_equal(first, supply().simulate(T, np.random.default_rng(5)))
-    assert np.all(first != second)
-    assert abs(np.corrcoef(first, second)[0, 1]) < 0.8
-
-
 def test_long_recordings_are_made_in_segments():
     t = np.arange(SEGMENT + 1000) / 1e4
     whole = supply().simulate(t, np.random.default_rng(6))

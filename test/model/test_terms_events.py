@@ -98,20 +98,6 @@ def test_switching_of_the_level():
         agrees(product.mean(), truth, product.std() / math.sqrt(n), 0.06 if k == 1 else 0.2)
 
 
-def test_rates_of_switching():
-    """Stays in either state are exponential with the stated rates, seen at 20 kHz."""
-    dt = 5e-5
-    x = still(term('regime_switching', rate_up=UP, rate_down=DOWN, level=1.0,
-                   sigma_ratio=1.0, at_once=1.0, states=2.0)).simulate(
-                       np.arange(2_000_000) * dt, np.random.default_rng(7))
-    at = np.flatnonzero(np.diff(x))
-    stays, state = np.diff(at) * dt, x[at[:-1] + 1] > 0.0
-    for value, rate in ((False, UP), (True, DOWN)):
-        own = stays[state == value]
-        agrees(own.mean(), 1.0 / rate, 1.0 / rate / math.sqrt(own.size), 0.2)
-        assert kstest(own, 'expon', (0.0, 1.0 / rate)).pvalue > 1e-4
-
-
 def test_a_level_that_comes_at_the_rate_alpha():
     """A telegraph behind a low-pass: variance level^2 p (1 - p) alpha/(alpha + up + down)."""
     # Whatever the steps: groups of samples 1 and 30 ms apart, independent of each other.

@@ -7,7 +7,7 @@ from ou_monitor.model.terms.term import View
 from ou_monitor.model.terms.tones import CONSTANT, power_spread, RINGING
 import pytest
 from scipy.signal import welch
-from term_examples import agrees, clusters, has_covariance, still, term
+from term_examples import clusters, has_covariance, still, term
 
 
 @pytest.mark.parametrize('frequency, damping, std, tilt', [
@@ -22,23 +22,6 @@ def test_resonance_has_its_damped_covariance(frequency, damping, std, tilt):
     turn = 2.0 * math.pi * frequency
     has_covariance(groups, offsets, lambda lag: std ** 2 * math.exp(-damping * lag) * (
         math.cos(turn * lag) + tilt * damping / turn * math.sin(turn * lag)))
-
-
-def test_resonance_at_even_stamps():
-    """Lags of a run at 1 kHz, also of half and whole periods."""
-    # A sample covariance at lag k has the variance (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
-    n, dt = 400_000, 1e-3
-    x = still(term('resonance', frequency=50.0, damping=20.0, std=0.05, tilt=0.0)).simulate(
-        np.arange(n) * dt, np.random.default_rng(2))
-
-    def cov(j):
-        lag = np.abs(j) * dt
-        return 0.0025 * np.exp(-20.0 * lag) * np.cos(2.0 * math.pi * 50.0 * lag)
-
-    j = np.arange(-600, 601)
-    for k in (0, 5, 10, 20, 40):
-        error = math.sqrt(np.sum(cov(j) ** 2 + cov(j + k) * cov(j - k)) / n)
-        agrees(np.mean(x[k:] * x[:n - k]), cov(k), error, 0.1 if k in (0, 10, 20) else math.inf)
 
 
 @pytest.mark.parametrize('start', [0.0, 1.7e9])

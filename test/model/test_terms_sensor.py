@@ -167,24 +167,6 @@ def test_the_covariance_is_exact_at_any_spacing(corner):
     has_covariance(groups, offsets, lambda lag: covariance(ALPHA, rate, lag))
 
 
-@pytest.mark.parametrize('dt', [1e-4, 1e-2, 2e-2])
-@pytest.mark.parametrize('corner', [10.026761414789407, 4.0])
-def test_covariance_at_even_stamps(corner, dt):
-    """Also in a run, where errors would add up; rate dt is 0.0025 to 1.3."""
-    # Standard error of a sample covariance: (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
-    rate = 2.0 * math.pi * corner
-    n = 1_000_000 if dt < 1e-3 else 100_000
-    x = supply(term('ac_coupling', corner=corner, offset=0.0)).simulate(
-        np.arange(n) * dt, np.random.default_rng(2))
-    span = math.ceil(12.0 / (rate * dt))
-    c = np.array([covariance(ALPHA, rate, j * dt) for j in range(2 * span)])
-    j = np.arange(-span + 1, span)
-    for k in (0, max(1, int(0.005 / dt))):
-        error = math.sqrt(np.sum(c[abs(j)] ** 2 + c[abs(j + k)] * c[abs(j - k)]) / n)
-        agrees(np.mean(x[k:] * x[:n - k]), c[k], error,
-               (0.05 if dt > 1e-3 else 0.15) if k == 0 else math.inf)
-
-
 def test_first_sample_is_stationary():
     """Over 5000 starts the first sample has the variance of all others; so has the tenth."""
     model = supply(term('ac_coupling', corner=5.0, offset=0.0))
