@@ -39,7 +39,7 @@ from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResu
 from ou_monitor.analysis.levels import LevelSegment, LoadLevel
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
-from ou_monitor.criticism.innovations import FAMILY_WISE, innovations
+from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, sampled_spectrum
 from ou_monitor.model.ou_fit import fit_pieces, white_variance
 from ou_monitor.model.spectral_lines import (
     EvenGrid, find_lines, LineSearch, on_grid, without_lines)
@@ -260,10 +260,8 @@ def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
     """Return the one-sided PSD of a *sampled* OU in white noise (frequency and rate in Hz, V)."""
     # The Lorentzian 2 sigma^2 / (alpha^2 + (2 pi f)^2) with its aliases is the spectrum of an
     # AR(1) with the coefficient exp(-alpha/rate).
-    phi = math.exp(-alpha / rate)
-    var_inf = sigma * sigma / (2.0 * alpha)
-    omega = 2.0 * math.pi * frequency / rate
-    ar1 = var_inf * (1.0 - phi * phi) / (1.0 - 2.0 * phi * np.cos(omega) + phi * phi)
+    ar1 = sigma * sigma / (2.0 * alpha) * sampled_spectrum(
+        2.0 * math.pi * frequency / rate, alpha / rate)
     white = noise_std * noise_std if math.isfinite(noise_std) else 0.0
     density: FloatArray = 2.0 / rate * (ar1 + white)
     return density

@@ -110,11 +110,11 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
     power = power / power.mean() - 1.0
     omega = 2.0 * np.pi * frequency / rate
     step = alpha / rate
-    fitted = var_inf * _spectrum(omega, step) + noise_var
+    fitted = var_inf * sampled_spectrum(omega, step) + noise_var
     # The fit absorbs a common factor, a change of alpha and a change of the white noise.
     nudge = 1e-3
-    slope = (_spectrum(omega, step * (1.0 + nudge))
-             - _spectrum(omega, step * (1.0 - nudge))) / nudge
+    slope = (sampled_spectrum(omega, step * (1.0 + nudge))
+             - sampled_spectrum(omega, step * (1.0 - nudge))) / nudge
     absorbed = np.linalg.qr(np.column_stack((
         np.ones(omega.size), var_inf * slope / fitted, 1.0 / fitted)))[0]
     more, share, less = 1.0, NAN, 1.0
@@ -122,7 +122,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
         slow = power[(omega < factor * step) & ~first]
         if factor < 1.0 and slow.sum() < _MISSING * slow.size:
             less = min(less, float(stats.gamma.cdf(slow.size + slow.sum(), slow.size)))
-        pattern = var_inf * _spectrum(omega, factor * step) / fitted
+        pattern = var_inf * sampled_spectrum(omega, factor * step) / fitted
         full = float(pattern @ pattern)
         pattern = pattern - absorbed @ (absorbed.T @ pattern)
         left = float(pattern @ pattern)
@@ -138,7 +138,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
     return OtherPole(min(1.0, len(FACTORS) * more), share, min(1.0, slower * less))
 
 
-def _spectrum(omega: FloatArray, step: float) -> FloatArray:
+def sampled_spectrum(omega: FloatArray, step: float) -> FloatArray:
     """Return the spectrum of a sampled OU of variance 1 (step: alpha times the time step)."""
     phi = math.exp(-step)
     found: FloatArray = -math.expm1(-2.0 * step) / (1.0 - 2.0 * phi * np.cos(omega) + phi * phi)

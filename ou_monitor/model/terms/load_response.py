@@ -29,25 +29,25 @@ class LoadSag(Term):
     empties, and falls as it warms.  A square or growth of exactly 0 is not fitted.
     """
 
-    NAME: ClassVar[str] = 'load_sag'
-    FAMILY: ClassVar[str] = 'load'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+    NAME = 'load_sag'
+    FAMILY = 'load'
+    STAGE = Stage.LEVEL
+    NEEDS_THROTTLE = True
+    ROLE = Role.MEAN
+    LINEAR = by_parameters(
         ('linear', 'square', 'growth'), lambda term: (
             'linear', *(name for name in ('square', 'growth') if getattr(term, name))))
-    SIGNS: ClassVar[tuple[str, ...]] = ('throttle', 'growing effect')
-    SEARCH: ClassVar[float] = by_parameters(0.0, lambda term: _GROWS if term.growth else 0.0)
-    MEASURED: ClassVar[bool] = True
-    LIVE: ClassVar[bool] = True
-    MEANING: ClassVar[str] = (
+    SIGNS = ('throttle', 'growing effect')
+    SEARCH = by_parameters(0.0, lambda term: _GROWS if term.growth else 0.0)
+    MEASURED = True
+    LIVE = True
+    MEANING = (
         'The mean falls with throttle: IR drop of battery, leads and regulator. The estimates are '
         'settled values; sag and resistance of the supply refer to 1 s after a step.')
-    REMEDY: ClassVar[str] = (
+    REMEDY = (
         'Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
         'reduce it.')
-    SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
+    SEPARATED_BY = 'throttle held for some seconds at several levels'
 
     linear: float = parameter('V', 'drop at full throttle, linear part',
                               label='settled fall, linear')
@@ -91,28 +91,28 @@ class LoadTransient(Term):
     as by a motor whose speed lags.
     """
 
-    NAME: ClassVar[str] = 'load_transient'
-    FAMILY: ClassVar[str] = 'load'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.MEAN
+    NAME = 'load_transient'
+    FAMILY = 'load'
+    STAGE = Stage.LEVEL
+    NEEDS_THROTTLE = True
+    ROLE = Role.MEAN
     # A rise, square or lagged of 0 is not fitted.
-    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+    LINEAR = by_parameters(
         ('gain', 'rise', 'square', 'lagged'), lambda term: (
             'gain', *(name for name in ('rise', 'square', 'lagged') if getattr(term, name))))
-    SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
-    SEARCH: ClassVar[float] = 3.4
-    FORM_COST: ClassVar[float] = by_parameters(0.0, lambda term: _LAGGED * (term.lagged != 0.0))
-    MEASURED: ClassVar[bool] = True
-    SEVERAL: ClassVar[bool] = True
-    RECURS: ClassVar[bool] = True
-    MEANING: ClassVar[str] = by_parameters(
+    SIGNS = ('throttle',)
+    SEARCH = 3.4
+    FORM_COST = by_parameters(0.0, lambda term: _LAGGED * (term.lagged != 0.0))
+    MEASURED = True
+    SEVERAL = True
+    RECURS = True
+    MEANING = by_parameters(
         'The mean responds to changes of throttle: lag, inrush or slow recovery of polarisation.',
         lambda term: term.about()[0])
-    REMEDY: ClassVar[str] = by_parameters(
+    REMEDY = by_parameters(
         'Include the fall after a throttle step in the brown-out margin.',
         lambda term: term.about()[1])
-    SEPARATED_BY: ClassVar[str] = (
+    SEPARATED_BY = (
         'single steps of throttle, each held for ten times the time constant of the response')
 
     gain: float = parameter('V', 'part of a step to full throttle that decays with tau',
@@ -228,21 +228,21 @@ _LASTING = 100.0
 class LoadDependentSigma(Term):
     """Multiply sigma by a factor whose ln is linear between knots, and constant beyond them."""
 
-    NAME: ClassVar[str] = 'load_dependent_sigma'
-    FAMILY: ClassVar[str] = 'intensity'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.DRIVE
-    SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle',)
-    MEASURED: ClassVar[bool] = True
+    NAME = 'load_dependent_sigma'
+    FAMILY = 'intensity'
+    STAGE = Stage.DRIVE
+    NEEDS_THROTTLE = True
+    ROLE = Role.DRIVE
+    SIGNS = ('variance throttle',)
+    MEASURED = True
     # Penalty of the search for a step's position.
-    SEARCH: ClassVar[float] = by_parameters(
+    SEARCH = by_parameters(
         0.0, lambda term: _STEP_COST if term.steps() else 0.0)
-    LIVE: ClassVar[bool] = True
-    MEANING: ClassVar[str] = 'The noise grows or shrinks with throttle.'
-    REMEDY: ClassVar[str] = (
+    LIVE = True
+    MEANING = 'The noise grows or shrinks with throttle.'
+    REMEDY = (
         'Run the estimator in flight, so that filter and risk use the noise at the present load.')
-    SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
+    SEPARATED_BY = 'throttle held for some seconds at several levels'
 
     throttle: tuple[float, ...] = parameters('', 'knots, rising')
     log_factor: tuple[float, ...] = parameters('', 'ln(sigma at the knot / sigma of the ou)')
@@ -386,19 +386,19 @@ def _greedy(bins: Bins, knots: FloatArray, penalty: float, apart: float
 class LoadDependentAlpha(Term):
     """Multiply alpha by exp(slope * throttle)."""
 
-    NAME: ClassVar[str] = 'load_dependent_alpha'
-    FAMILY: ClassVar[str] = 'restoring'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.DRIVE
-    FREE: ClassVar[tuple[str, ...]] = ('slope',)
-    SIGNS: ClassVar[tuple[str, ...]] = ('state throttle',)
-    MEASURED: ClassVar[bool] = True
-    LIVE: ClassVar[bool] = True
-    MEANING: ClassVar[str] = 'The relaxation rate depends on throttle.'
-    REMEDY: ClassVar[str] = (
+    NAME = 'load_dependent_alpha'
+    FAMILY = 'restoring'
+    STAGE = Stage.DRIVE
+    NEEDS_THROTTLE = True
+    ROLE = Role.DRIVE
+    FREE = ('slope',)
+    SIGNS = ('state throttle',)
+    MEASURED = True
+    LIVE = True
+    MEANING = 'The relaxation rate depends on throttle.'
+    REMEDY = (
         'Fit each throttle level separately (analyze): a single alpha is right at one level only.')
-    SEPARATED_BY: ClassVar[str] = 'throttle held for 50 relaxation times at each of several levels'
+    SEPARATED_BY = 'throttle held for 50 relaxation times at each of several levels'
 
     slope: float = parameter('', 'ln of the factor at full throttle')
 
@@ -476,19 +476,19 @@ class LoadDependentNoise(Term):
     itself, sigma is multiplied by a power of the factor.
     """
 
-    NAME: ClassVar[str] = 'load_dependent_noise'
-    FAMILY: ClassVar[str] = 'intensity'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.DRIVE
-    SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle', 'variance change')
-    MEASURED: ClassVar[bool] = True
+    NAME = 'load_dependent_noise'
+    FAMILY = 'intensity'
+    STAGE = Stage.DRIVE
+    NEEDS_THROTTLE = True
+    ROLE = Role.DRIVE
+    SIGNS = ('variance throttle', 'variance change')
+    MEASURED = True
     # Penalty of the search for inputs and knots.
-    SEARCH: ClassVar[float] = by_parameters(0.0, lambda term: sum(
+    SEARCH = by_parameters(0.0, lambda term: sum(
         _KNOT_COST * (values.size - 2) + _INPUT_COST for _, values in term.curves().values()))
-    APART: ClassVar[int] = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
-    CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
-    MEANING: ClassVar[str] = (
+    APART = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
+    CHANGES = MeasurementNoise
+    MEANING = (
         'The white noise of the readings grows with throttle or its changes: ripple of the ESCs, '
         'or a rail that relaxes faster than the sampling, which looks the same.')
     REMEDY: ClassVar[str] = by_parameters(
@@ -496,7 +496,7 @@ class LoadDependentNoise(Term):
         'ESCs or a filter before the ADC. Give readings at high throttle less weight.',
         lambda term: LoadDependentNoise.REMEDY if 0 in term.number else
         LoadDependentNoise.REMEDY.replace('at high throttle', 'soon after changes of throttle'))
-    SEPARATED_BY: ClassVar[str] = (
+    SEPARATED_BY = (
         'the same flight at several times the sampling rate: white noise stays uncorrelated')
 
     number: tuple[float, ...] = parameters('', 'index of the input of each knot: see INPUTS, SUM')

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -32,10 +31,10 @@ class OU(Term):
     integrated by Strang splitting, weak order 2.
     """
 
-    NAME: ClassVar[str] = 'ou'
-    STAGE: ClassVar[Stage] = Stage.STATE
-    FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
-    LIVE: ClassVar[bool] = True
+    NAME = 'ou'
+    STAGE = Stage.STATE
+    FREE = ('alpha', 'sigma')
+    LIVE = True
 
     alpha: float = parameter('1/s', 'relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'noise intensity', 0.0)
@@ -128,18 +127,18 @@ def _stiffness(s: Segment) -> FloatArray:
 class NonlinearRestoring(Term):
     """Add square * x^2 + cube * x^3 to the force alpha x; a square requires a cube above 0."""
 
-    NAME: ClassVar[str] = 'nonlinear_restoring'
-    FAMILY: ClassVar[str] = 'restoring'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    ROLE: ClassVar[Role] = Role.LAW
-    SIGNS: ClassVar[tuple[str, ...]] = ('state squared', 'state cubed')
-    IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching',)
-    MEANING: ClassVar[str] = (
+    NAME = 'nonlinear_restoring'
+    FAMILY = 'restoring'
+    STAGE = Stage.DRIVE
+    ROLE = Role.LAW
+    SIGNS = ('state squared', 'state cubed')
+    IMITATES = ('regime_switching',)
+    MEANING = (
         'The restoring force is not proportional to the deviation: a constant-power load, or '
         'softening near brown-out.')
-    REMEDY: ClassVar[str] = (
+    REMEDY = (
         'Expect deep excursions to be longer and more frequent than the linear model predicts.')
-    SEPARATED_BY: ClassVar[str] = 'larger excursions: load steps in both directions'
+    SEPARATED_BY = 'larger excursions: load steps in both directions'
 
     square: float = parameter('1/(V s)', 'coefficient of x^2')
     cube: float = parameter('1/(V^2 s)', 'coefficient of x^3', 0.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.hidden_chain import forward
@@ -19,20 +18,20 @@ from ou_monitor.records import FloatArray
 class MeasurementNoise(Term):
     """Add independent normal errors."""
 
-    NAME: ClassVar[str] = 'measurement_noise'
-    FAMILY: ClassVar[str] = 'sensor'
-    STAGE: ClassVar[Stage] = Stage.SENSOR
-    ROLE: ClassVar[Role] = Role.NOISE
-    FREE: ClassVar[tuple[str, ...]] = ('std',)
-    SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
-    MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = (
+    NAME = 'measurement_noise'
+    FAMILY = 'sensor'
+    STAGE = Stage.SENSOR
+    ROLE = Role.NOISE
+    FREE = ('std',)
+    SIGNS = ('-autocorrelation', '+band')
+    MAY_LEAVE = 0.3
+    MEANING = (
         'The readings have white noise: from the sensor, or from a rail that relaxes faster than '
         'the sampling, which looks the same.')
-    REMEDY: ClassVar[str] = (
+    REMEDY = (
         'Sample faster to tell sensor noise from a fast rail; against sensor noise, average in '
         'the ADC or use a finer range. Alpha and sigma fitted without this noise are too high.')
-    SEPARATED_BY: ClassVar[str] = (
+    SEPARATED_BY = (
         'the same rail at several times the sampling rate, or the input of the ADC shorted')
 
     std: float = parameter('V', 'standard deviation', 0.0)
@@ -78,21 +77,21 @@ class LopsidedNoise(Term):
     are heavier.  Without a `measurement_noise`, the term has no effect.
     """
 
-    NAME: ClassVar[str] = 'lopsided_noise'
-    FAMILY: ClassVar[str] = 'events'
-    STAGE: ClassVar[Stage] = Stage.INSTRUMENT
-    ROLE: ClassVar[Role] = Role.LAW
-    SIGNS: ClassVar[tuple[str, ...]] = ('skewness', 'kurtosis', 'tails')
-    IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'glitches', 'heavy_tails', 'jumps')
-    CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
-    MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = (
+    NAME = 'lopsided_noise'
+    FAMILY = 'events'
+    STAGE = Stage.INSTRUMENT
+    ROLE = Role.LAW
+    SIGNS = ('skewness', 'kurtosis', 'tails')
+    IMITATES = ('clock_jitter', 'glitches', 'heavy_tails', 'jumps')
+    CHANGES = MeasurementNoise
+    MAY_LEAVE = 0.3
+    MEANING = (
         'The white noise is asymmetric, with dips rarer and deeper than rises or the reverse: '
         'load pulses that are shorter than the time between readings and not visible in throttle.')
-    REMEDY: ClassVar[str] = (
+    REMEDY = (
         'Take the margin from the quantile of the dips, not from the rms; capacitance at the ESCs '
         'makes short dips shallower.')
-    SEPARATED_BY: ClassVar[str] = 'the same flight at several times the sampling rate'
+    SEPARATED_BY = 'the same flight at several times the sampling rate'
 
     skew: float = parameter('', 'asymmetry: below 0, dips are deeper than rises')
     tail: float = parameter('', '1: normal tails, below 1: heavier tails', 0.0,
@@ -180,14 +179,13 @@ def _lopsided_scores(z: FloatArray, skew: float, log_tail: float, log_scale: flo
 class Quantization(Term):
     """Round to a multiple of `step`."""
 
-    NAME: ClassVar[str] = 'quantization'
-    FAMILY: ClassVar[str] = 'sensor'
-    STAGE: ClassVar[Stage] = Stage.CODE
-    ROLE: ClassVar[Role] = Role.NOISE
-    MEANING: ClassVar[str] = 'The resolution of the ADC is comparable to the noise.'
-    REMEDY: ClassVar[str] = (
-        'Use a smaller range of the ADC or more gain before it; a part of sigma is rounding.')
-    SEPARATED_BY: ClassVar[str] = 'the same rail with a smaller range of the ADC'
+    NAME = 'quantization'
+    FAMILY = 'sensor'
+    STAGE = Stage.CODE
+    ROLE = Role.NOISE
+    MEANING = 'The resolution of the ADC is comparable to the noise.'
+    REMEDY = 'Use a smaller range of the ADC or more gain before it; a part of sigma is rounding.'
+    SEPARATED_BY = 'the same rail with a smaller range of the ADC'
 
     step: float = parameter('V', 'resolution, one code', 0.0, above=True)
 
@@ -202,14 +200,13 @@ class Quantization(Term):
 class Saturation(Term):
     """Clip the voltage at limits."""
 
-    NAME: ClassVar[str] = 'saturation'
-    FAMILY: ClassVar[str] = 'sensor'
-    STAGE: ClassVar[Stage] = Stage.CLIP
-    ROLE: ClassVar[Role] = Role.EXACT
-    MEANING: ClassVar[str] = 'The voltage is clipped at the end of the range of the ADC.'
-    REMEDY: ClassVar[str] = (
-        'Rescale the input: the true excursions are larger than recorded.')
-    SEPARATED_BY: ClassVar[str] = 'the same rail with a larger range'
+    NAME = 'saturation'
+    FAMILY = 'sensor'
+    STAGE = Stage.CLIP
+    ROLE = Role.EXACT
+    MEANING = 'The voltage is clipped at the end of the range of the ADC.'
+    REMEDY = 'Rescale the input: the true excursions are larger than recorded.'
+    SEPARATED_BY = 'the same rail with a larger range'
 
     low: float = parameter('V', 'lowest reading')
     high: float = parameter('V', 'highest reading')
@@ -228,14 +225,13 @@ class Saturation(Term):
 class HeldSamples(Term):
     """Repeat each value for 1/rate."""
 
-    NAME: ClassVar[str] = 'held_samples'
-    FAMILY: ClassVar[str] = 'sensor'
-    STAGE: ClassVar[Stage] = Stage.LOGGER
-    ROLE: ClassVar[Role] = Role.EXACT
-    MEANING: ClassVar[str] = 'The logger repeats the last value until the source has a new one.'
-    REMEDY: ClassVar[str] = (
-        'Log at the rate of the source, or remove repeats before a fit, as this program does.')
-    SEPARATED_BY: ClassVar[str] = 'the raw samples of the ADC'
+    NAME = 'held_samples'
+    FAMILY = 'sensor'
+    STAGE = Stage.LOGGER
+    ROLE = Role.EXACT
+    MEANING = 'The logger repeats the last value until the source has a new one.'
+    REMEDY = 'Log at the rate of the source, or remove repeats before a fit, as this program does.'
+    SEPARATED_BY = 'the raw samples of the ADC'
 
     rate: float = parameter('Hz', 'update rate of the source', 0.0, above=True)
 
@@ -260,16 +256,16 @@ class HeldSamples(Term):
 class ClockJitter(Term):
     """Take each sample at its stamp plus a normal error, clipped at 0.45 of the step."""
 
-    NAME: ClassVar[str] = 'clock_jitter'
-    FAMILY: ClassVar[str] = 'sensor'
-    STAGE: ClassVar[Stage] = Stage.CLOCK
-    ROLE: ClassVar[Role] = Role.LAW
-    SLOW_FIT: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'clustering')
-    IMITATES: ClassVar[tuple[str, ...]] = ('glitches', 'heavy_tails', 'jumps')
-    MEANING: ClassVar[str] = 'Time stamps have random errors.'
-    REMEDY: ClassVar[str] = 'Take the stamp in the interrupt of the ADC, not when sending.'
-    SEPARATED_BY: ClassVar[str] = 'a recording that also has the stamps of the ADC'
+    NAME = 'clock_jitter'
+    FAMILY = 'sensor'
+    STAGE = Stage.CLOCK
+    ROLE = Role.LAW
+    SLOW_FIT = True
+    SIGNS = ('kurtosis', 'clustering')
+    IMITATES = ('glitches', 'heavy_tails', 'jumps')
+    MEANING = 'Time stamps have random errors.'
+    REMEDY = 'Take the stamp in the interrupt of the ADC, not when sending.'
+    SEPARATED_BY = 'a recording that also has the stamps of the ADC'
 
     std: float = parameter('s', 'standard deviation of the error of a stamp', 0.0)
 
@@ -348,8 +344,8 @@ class ClockJitter(Term):
 class JitterOnLines(ClockJitter):
     """Errors of stamps that are visible on pure tones: white noise in proportion to the slope."""
 
-    ROLE: ClassVar[Role] = Role.NOISE
-    FREE: ClassVar[tuple[str, ...]] = ('std',)
+    ROLE = Role.NOISE
+    FREE = ('std',)
 
     def holds(self, view: View) -> bool:
         """Return whether the errors are too small to change the order of the samples."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
@@ -321,21 +320,21 @@ class RegimeSwitching(Term):
     of a step in which it is constant.
     """
 
-    NAME: ClassVar[str] = 'regime_switching'
-    FAMILY: ClassVar[str] = 'switching'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    ROLE: ClassVar[Role] = Role.LAW
-    SLOW_FIT: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = (
+    NAME = 'regime_switching'
+    FAMILY = 'switching'
+    STAGE = Stage.DRIVE
+    ROLE = Role.LAW
+    SLOW_FIT = True
+    SIGNS = (
         '+clustering', '+kurtosis', '+band 0', '+band 1', '+band 2', '+band 3', 'state squared',
         'state cubed')
-    IMITATES: ClassVar[tuple[str, ...]] = (
+    IMITATES = (
         'flicker_noise', 'heavy_tails', 'jumps', 'nonlinear_restoring', 'second_relaxation',
         'volatility')
-    SEVERAL: ClassVar[bool] = True
-    MEANING: ClassVar[str] = 'The supply switches between states, independent of throttle.'
-    REMEDY: ClassVar[str] = 'Look for a load that switches on and off, or a loose contact.'
-    SEPARATED_BY: ClassVar[str] = 'a recording with the state of the other loads'
+    SEVERAL = True
+    MEANING = 'The supply switches between states, independent of throttle.'
+    REMEDY = 'Look for a load that switches on and off, or a loose contact.'
+    SEPARATED_BY = 'a recording with the state of the other loads'
 
     rate_up: float = parameter('1/s', 'rate of switching to each higher state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of switching to each lower state', 0.0, above=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,18 +29,16 @@ _OFTEN = 0.05
 class Jumps(Term):
     """Add jumps of normally distributed size to the state, at the times of a Poisson process."""
 
-    NAME: ClassVar[str] = 'jumps'
-    FAMILY: ClassVar[str] = 'events'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    ROLE: ClassVar[Role] = Role.LAW
-    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails', 'skewness')
-    IMITATES: ClassVar[tuple[str, ...]] = (
-        'clock_jitter', 'glitches', 'heavy_tails', 'regime_switching', 'volatility')
-    SEVERAL: ClassVar[bool] = True
-    MEANING: ClassVar[str] = (
-        'Random jumps of the rail that decay at the rate alpha: load pulses.')
-    REMEDY: ClassVar[str] = 'Look for loads that switch at that rate: servos, payload, radio.'
-    SEPARATED_BY: ClassVar[str] = 'recordings with one load after another switched off'
+    NAME = 'jumps'
+    FAMILY = 'events'
+    STAGE = Stage.DRIVE
+    ROLE = Role.LAW
+    SIGNS = ('kurtosis', 'tails', 'skewness')
+    IMITATES = 'clock_jitter', 'glitches', 'heavy_tails', 'regime_switching', 'volatility'
+    SEVERAL = True
+    MEANING = 'Random jumps of the rail that decay at the rate alpha: load pulses.'
+    REMEDY = 'Look for loads that switch at that rate: servos, payload, radio.'
+    SEPARATED_BY = 'recordings with one load after another switched off'
 
     rate: float = parameter('1/s', 'jumps per second', 0.0)
     mean: float = parameter('V', 'mean size')
@@ -143,20 +140,20 @@ def _mixture(z: FloatArray, var: FloatArray) -> tuple[float, float, float, float
 class Glitches(Term):
     """Add a normal error to some samples."""
 
-    NAME: ClassVar[str] = 'glitches'
-    FAMILY: ClassVar[str] = 'events'
-    STAGE: ClassVar[Stage] = Stage.SENSOR
-    ROLE: ClassVar[Role] = Role.LAW
-    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails', 'pairs', 'autocorrelation')
-    IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'heavy_tails', 'jumps')
-    SEVERAL: ClassVar[bool] = True
-    MEANING: ClassVar[str] = (
+    NAME = 'glitches'
+    FAMILY = 'events'
+    STAGE = Stage.SENSOR
+    ROLE = Role.LAW
+    SIGNS = ('kurtosis', 'tails', 'pairs', 'autocorrelation')
+    IMITATES = ('clock_jitter', 'heavy_tails', 'jumps')
+    SEVERAL = True
+    MEANING = (
         'Outlying single readings, or a few in a row, without relaxation after them: bus errors, '
         'pick-up at the ADC, or real dips of a few samples.')
-    REMEDY: ClassVar[str] = (
+    REMEDY = (
         'Before you reject them, check with a faster or a second ADC that they are not real dips; '
         'check the cables and the ground of the ADC.')
-    SEPARATED_BY: ClassVar[str] = 'two ADCs on one rail: a glitch shows in only one'
+    SEPARATED_BY = 'two ADCs on one rail: a glitch shows in only one'
 
     probability: float = parameter('', 'share of samples that are bad', 0.0, 1.0)
     std: float = parameter('V', 'standard deviation of the error', 0.0)
@@ -331,16 +328,15 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 class HeavyTails(Term):
     """Make each step's noise Student-t, with the same variance; dof is for one step length."""
 
-    NAME: ClassVar[str] = 'heavy_tails'
-    FAMILY: ClassVar[str] = 'events'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    ROLE: ClassVar[Role] = Role.LAW
-    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails')
-    IMITATES: ClassVar[tuple[str, ...]] = (
-        'clock_jitter', 'glitches', 'jumps', 'regime_switching', 'volatility')
-    MEANING: ClassVar[str] = 'The driving noise itself has heavy tails, without distinct events.'
-    REMEDY: ClassVar[str] = 'Expect more large excursions than a normal distribution predicts.'
-    SEPARATED_BY: ClassVar[str] = 'a recording several times as long, at a higher rate'
+    NAME = 'heavy_tails'
+    FAMILY = 'events'
+    STAGE = Stage.DRIVE
+    ROLE = Role.LAW
+    SIGNS = ('kurtosis', 'tails')
+    IMITATES = 'clock_jitter', 'glitches', 'jumps', 'regime_switching', 'volatility'
+    MEANING = 'The driving noise itself has heavy tails, without distinct events.'
+    REMEDY = 'Expect more large excursions than a normal distribution predicts.'
+    SEPARATED_BY = 'a recording several times as long, at a higher rate'
 
     dof: float = parameter('', 'degrees of freedom', 2.0, above=True)
 
@@ -431,17 +427,16 @@ _SHARES, _CELLS, _WIDTH = 8, 300, 0.03
 class Volatility(Term):
     """Multiply sigma and white noise by exp(a second OU), which is constant within a step."""
 
-    NAME: ClassVar[str] = 'volatility'
-    FAMILY: ClassVar[str] = 'intensity'
-    STAGE: ClassVar[Stage] = Stage.DRIVE
-    ROLE: ClassVar[Role] = Role.LAW
-    SLOW_FIT: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis')
-    IMITATES: ClassVar[tuple[str, ...]] = ('heavy_tails', 'jumps', 'regime_switching')
-    MEANING: ClassVar[str] = 'sigma changes slowly at random, independent of throttle.'
-    REMEDY: ClassVar[str] = 'Use an estimator window much shorter than 1/rate.'
-    SEPARATED_BY: ClassVar[str] = (
-        'a recording several times as long that includes the temperature')
+    NAME = 'volatility'
+    FAMILY = 'intensity'
+    STAGE = Stage.DRIVE
+    ROLE = Role.LAW
+    SLOW_FIT = True
+    SIGNS = ('clustering', 'kurtosis')
+    IMITATES = ('heavy_tails', 'jumps', 'regime_switching')
+    MEANING = 'sigma changes slowly at random, independent of throttle.'
+    REMEDY = 'Use an estimator window much shorter than 1/rate.'
+    SEPARATED_BY = 'a recording several times as long that includes the temperature'
 
     std: float = parameter('', 'standard deviation of ln sigma', 0.0)
     rate: float = parameter('1/s', 'relaxation rate of ln sigma', 0.0, above=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
@@ -23,21 +22,21 @@ class Drift(Term):
     curvature or charge of 0 is not fitted.
     """
 
-    NAME: ClassVar[str] = 'drift'
-    FAMILY: ClassVar[str] = 'slow'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    NEEDS_THROTTLE: ClassVar[bool] = by_parameters(False, lambda term: term.charge != 0.0)
-    ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+    NAME = 'drift'
+    FAMILY = 'slow'
+    STAGE = Stage.LEVEL
+    NEEDS_THROTTLE = by_parameters(False, lambda term: term.charge != 0.0)
+    ROLE = Role.MEAN
+    LINEAR = by_parameters(
         ('rate', 'curvature', 'charge'), lambda term: (
             'rate', *(name for name in ('curvature', 'charge') if getattr(term, name))))
-    SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
-    MEASURED: ClassVar[bool] = True
+    SIGNS = ('time', 'band 0')
+    MEASURED = True
     # The form of a larger effect is never exact, and a trend may explain the little that is left.
-    LEAST_SHARE: ClassVar[float] = 0.02
-    MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
-    REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'
-    SEPARATED_BY: ClassVar[str] = 'a recording several times as long'
+    LEAST_SHARE = 0.02
+    MEANING = 'The mean moves slowly with time: discharge or warming.'
+    REMEDY = 'Use a window in which the drift is small, or remove the trend first.'
+    SEPARATED_BY = 'a recording several times as long'
 
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
@@ -76,22 +75,22 @@ _LEAST = 3.0
 class SecondRelaxation(Term):
     """Add an independent OU."""
 
-    NAME: ClassVar[str] = 'second_relaxation'
-    FAMILY: ClassVar[str] = 'slow'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    ROLE: ClassVar[Role] = Role.BLOCK
-    FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
-    SLOW_FIT: ClassVar[bool] = True
-    BROAD: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
-    STATES: ClassVar[int] = 1
-    IMITATES: ClassVar[tuple[str, ...]] = ('flicker_noise', 'regime_switching')
-    SEVERAL: ClassVar[bool] = True
-    RECURS: ClassVar[bool] = True
-    MEANING: ClassVar[str] = (
+    NAME = 'second_relaxation'
+    FAMILY = 'slow'
+    STAGE = Stage.LEVEL
+    ROLE = Role.BLOCK
+    FREE = ('alpha', 'sigma')
+    SLOW_FIT = True
+    BROAD = True
+    SIGNS = ('band', 'autocorrelation')
+    STATES = 1
+    IMITATES = ('flicker_noise', 'regime_switching')
+    SEVERAL = True
+    RECURS = True
+    MEANING = (
         'A second relaxation, with its own rate, adds to the first: a second storage element.')
-    REMEDY: ClassVar[str] = 'Keep both relaxations in the model: a single alpha describes neither.'
-    SEPARATED_BY: ClassVar[str] = 'a recording ten times as long, throttle held still'
+    REMEDY = 'Keep both relaxations in the model: a single alpha describes neither.'
+    SEPARATED_BY = 'a recording ten times as long, throttle held still'
 
     alpha: float = parameter('1/s', 'its relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'its noise intensity', 0.0)
@@ -150,21 +149,20 @@ class FlickerNoise(Term):
     spacing.
     """
 
-    NAME: ClassVar[str] = 'flicker_noise'
-    FAMILY: ClassVar[str] = 'slow'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    ROLE: ClassVar[Role] = Role.BLOCK
-    FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'high')
-    SLOW_FIT: ClassVar[bool] = True
-    BROAD: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
+    NAME = 'flicker_noise'
+    FAMILY = 'slow'
+    STAGE = Stage.LEVEL
+    ROLE = Role.BLOCK
+    FREE = ('amplitude', 'high')
+    SLOW_FIT = True
+    BROAD = True
+    SIGNS = ('band', 'autocorrelation')
     # Minimum number of states; it grows by one every three octaves.
-    STATES: ClassVar[int] = 4
-    IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
-    MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
-    REMEDY: ClassVar[str] = (
-        'Alpha depends on the length of the window: compare only windows of equal length.')
-    SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
+    STATES = 4
+    IMITATES = ('regime_switching', 'second_relaxation')
+    MEANING = '1/f noise: there is no single relaxation time.'
+    REMEDY = 'Alpha depends on the length of the window: compare only windows of equal length.'
+    SEPARATED_BY = 'a recording over two more decades of frequency'
 
     amplitude: float = parameter('V', 'square root of (f times PSD)', 0.0)
     low: float = parameter('Hz', 'lower end', 0.0, above=True)
@@ -290,24 +288,23 @@ class ACCoupling(Term):
     approximated by straight lines between samples.
     """
 
-    NAME: ClassVar[str] = 'ac_coupling'
-    FAMILY: ClassVar[str] = 'instrument'
-    STAGE: ClassVar[Stage] = Stage.INSTRUMENT
-    ROLE: ClassVar[Role] = Role.BLOCK
-    FREE: ClassVar[tuple[str, ...]] = ('corner',)
-    SLOW_FIT: ClassVar[bool] = True
-    BROAD: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
-    STATES: ClassVar[int] = 1
-    SEVERAL: ClassVar[bool] = True
+    NAME = 'ac_coupling'
+    FAMILY = 'instrument'
+    STAGE = Stage.INSTRUMENT
+    ROLE = Role.BLOCK
+    FREE = ('corner',)
+    SLOW_FIT = True
+    BROAD = True
+    SIGNS = ('-band',)
+    STATES = 1
+    SEVERAL = True
     # An instrument may have two corners; one term alone leaves a part of the effect.
-    MAY_LEAVE: ClassVar[float] = 0.75
-    MEANING: ClassVar[str] = (
-        'The instrument is AC-coupled: the relaxation comes from its high-pass.')
-    REMEDY: ClassVar[str] = (
+    MAY_LEAVE = 0.75
+    MEANING = 'The instrument is AC-coupled: the relaxation comes from its high-pass.'
+    REMEDY = (
         'Repeat with DC coupling; use the alpha of this model for the rail, not the alpha of the '
         'plain fit.')
-    SEPARATED_BY: ClassVar[str] = 'the same rail DC-coupled'
+    SEPARATED_BY = 'the same rail DC-coupled'
 
     corner: float = parameter('Hz', 'corner (-3 dB) of the high-pass', 0.0, above=True)
     offset: float = parameter('V', 'mean level of the readings')

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
@@ -21,28 +20,26 @@ from scipy.signal import welch
 class Tone(Term):
     """Add a sine whose phase is a random walk, so that its spectral line is `linewidth` wide."""
 
-    NAME: ClassVar[str] = 'tone'
-    FAMILY: ClassVar[str] = 'line'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
+    NAME = 'tone'
+    FAMILY = 'line'
+    STAGE = Stage.LEVEL
     # If the phase wanders, the term has two states instead of known columns.
-    ROLE: ClassVar[Role] = by_parameters(
+    ROLE = by_parameters(
         Role.MEAN, lambda term: Role.BLOCK if term.linewidth else Role.MEAN)
-    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+    LINEAR = by_parameters(
         ('amplitude', 'phase'), lambda term: () if term.linewidth else ('amplitude', 'phase'))
-    FREE: ClassVar[tuple[str, ...]] = by_parameters(
+    FREE = by_parameters(
         (), lambda term: ('amplitude', 'frequency', 'linewidth') if term.linewidth else ())
-    SIGNS: ClassVar[tuple[str, ...]] = ('line',)
-    SEARCH: ClassVar[float] = 10.0
-    STATES: ClassVar[int] = 2
-    SEVERAL: ClassVar[bool] = True
-    RECURS: ClassVar[bool] = True
-    MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = (
+    SIGNS = ('line',)
+    SEARCH = 10.0
+    STATES = 2
+    SEVERAL = True
+    RECURS = True
+    MAY_LEAVE = 0.3
+    MEANING = (
         'A spectral line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.')
-    REMEDY: ClassVar[str] = (
-        'Find the source from its frequency; sample at another rate to identify an alias.')
-    SEPARATED_BY: ClassVar[str] = (
-        'the same rail at two sampling rates: an alias moves, a true line does not')
+    REMEDY = 'Find the source from its frequency; sample at another rate to identify an alias.'
+    SEPARATED_BY = 'the same rail at two sampling rates: an alias moves, a true line does not'
 
     amplitude: float = parameter('V', 'peak', 0.0)
     frequency: float = parameter('Hz', 'frequency', 0.0, above=True)
@@ -131,27 +128,27 @@ class Resonance(Term):
     frequencies), -1 the current of its choke (nothing at 0 Hz).
     """
 
-    NAME: ClassVar[str] = 'resonance'
-    FAMILY: ClassVar[str] = 'line'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    ROLE: ClassVar[Role] = Role.BLOCK
+    NAME = 'resonance'
+    FAMILY = 'line'
+    STAGE = Stage.LEVEL
+    ROLE = Role.BLOCK
     # The tilt is fitted unless it is 0.
-    FREE: ClassVar[tuple[str, ...]] = by_parameters(
+    FREE = by_parameters(
         ('frequency', 'damping', 'std'),
         lambda term: ('frequency', 'damping', 'std', *(('tilt',) if term.tilt else ())))
-    SLOW_FIT: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band', 'autocorrelation')
-    SEARCH: ClassVar[float] = 5.0
-    STATES: ClassVar[int] = 2
-    SEVERAL: ClassVar[bool] = True
-    RECURS: ClassVar[bool] = True
+    SLOW_FIT = True
+    SIGNS = ('line', '+band', 'autocorrelation')
+    SEARCH = 5.0
+    STATES = 2
+    SEVERAL = True
+    RECURS = True
     # A limit is needed, because a broad line fits almost any spectrum.
-    MAY_LEAVE: ClassVar[float] = 0.1
+    MAY_LEAVE = 0.1
     # Ringing that is driven by noise is Gaussian, so it has no bursts and no third moments.
-    REFUTED_BY: ClassVar[tuple[str, ...]] = ('bursts', 'products of three')
-    MEANING: ClassVar[str] = 'The rail rings: inductance of the leads against the capacitors.'
-    REMEDY: ClassVar[str] = 'Damp it with a resistive (electrolytic) capacitor or shorter leads.'
-    SEPARATED_BY: ClassVar[str] = 'constant throttle, sampled at ten times that frequency'
+    REFUTED_BY = ('bursts', 'products of three')
+    MEANING = 'The rail rings: inductance of the leads against the capacitors.'
+    REMEDY = 'Damp it with a resistive (electrolytic) capacitor or shorter leads.'
+    SEPARATED_BY = 'constant throttle, sampled at ten times that frequency'
 
     frequency: float = parameter('Hz', 'frequency of the ringing', 0.0, above=True)
     damping: float = parameter('1/s', 'decay rate of the ringing', 0.0, above=True)
@@ -219,22 +216,22 @@ _STEEP, _STEEPEST = 0.9, 0.99
 class ThrottleTone(Term):
     """Add a sine of frequency idle + slope * throttle, with the random phase of `Tone`."""
 
-    NAME: ClassVar[str] = 'throttle_tone'
-    FAMILY: ClassVar[str] = 'line'
-    STAGE: ClassVar[Stage] = Stage.LEVEL
-    NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.BLOCK
-    FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'linewidth')
-    SLOW_FIT: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('order', 'line')
-    SEARCH: ClassVar[float] = 9.0
-    STATES: ClassVar[int] = 2
-    SEVERAL: ClassVar[bool] = True
-    RECURS: ClassVar[bool] = True
-    MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = 'A spectral line that follows throttle: commutation of the motors.'
-    REMEDY: ClassVar[str] = 'Add capacitance at the ESC, or a notch that follows throttle.'
-    SEPARATED_BY: ClassVar[str] = 'a slow sweep of throttle'
+    NAME = 'throttle_tone'
+    FAMILY = 'line'
+    STAGE = Stage.LEVEL
+    NEEDS_THROTTLE = True
+    ROLE = Role.BLOCK
+    FREE = ('amplitude', 'linewidth')
+    SLOW_FIT = True
+    SIGNS = ('order', 'line')
+    SEARCH = 9.0
+    STATES = 2
+    SEVERAL = True
+    RECURS = True
+    MAY_LEAVE = 0.3
+    MEANING = 'A spectral line that follows throttle: commutation of the motors.'
+    REMEDY = 'Add capacitance at the ESC, or a notch that follows throttle.'
+    SEPARATED_BY = 'a slow sweep of throttle'
 
     amplitude: float = parameter('V', 'peak', 0.0)
     idle: float = parameter('Hz', 'frequency at zero throttle; below 0 for an alias')
