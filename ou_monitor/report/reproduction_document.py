@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 import math
 
 import numpy as np
@@ -32,8 +33,8 @@ def reproduction_document(result: Reproduction) -> Document:
             'errors, or the range given) includes it. Rounding: it agrees if the underlying '
             'readings are varied within their own rounding. Claims are written as bounds: "> 0" '
             'means that something rises.', legend=True)]),
-        *[Section(f'{where}, {tally(rows)}', [_table(rows), _explanations(rows)], folded=True)
-          for where, rows in result.parts()],
+        *[Section(f'{where}, {tally(rows)}', [_table(rows), partial(_explanations, rows)],
+                  folded=True) for where, rows in result.parts()],
         Text(f'Random numbers from seed {result.seed}; another seed changes the simulated numbers '
              'within their standard errors.', legend=True)]
     return Document('The paper, recomputed', 'Deterministic and stochastic matrix modeling of '
@@ -48,9 +49,8 @@ def _table(rows: Sequence[Row]) -> Table:
           recomputed(row), row.verdict.value] for row in rows], left=[0, 1, 4])
 
 
-def _explanations(rows: Sequence[Row]) -> Callable[[], list[Part]]:
-    """Return a function that gives the meaning of each row, and how it was recomputed."""
-    return lambda: [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
+def _explanations(rows: Sequence[Row]) -> list[Part]:
+    return [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 
 
 def _screens(result: Reproduction) -> list[Part]:

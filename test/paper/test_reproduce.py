@@ -30,12 +30,6 @@ def test_rounding_is_half_a_unit_of_the_last_digit(text, value, half_unit):
     assert printed.ends == pytest.approx((value - half_unit, value + half_unit), rel=1e-6)
 
 
-@pytest.mark.parametrize('text', ['abc', '', 'nan', 'inf'])
-def test_text_without_a_number_is_refused(text):
-    with pytest.raises(ValueError, match=f"'{text}'"):
-        Printed(text)
-
-
 @pytest.mark.parametrize('recomputed, verdict', [
     (63.05, RowVerdict.AGREES), (62.95, RowVerdict.AGREES), (63.06, RowVerdict.DOES_NOT_HOLD),
     (62.94, RowVerdict.DOES_NOT_HOLD)])
@@ -91,10 +85,8 @@ def test_the_verdict_cannot_be_given():
 
 
 @pytest.mark.parametrize('recomputed, ranges', [
-    (math.nan, {}), (math.inf, {}), (1.0, {'error': math.nan}), (1.0, {'error': -1.0}),
-    (1.0, {'band': (2.0, 1.0)}), (1.0, {'inputs': (math.nan, 1.0)})])
-def test_rows_without_a_verdict_are_refused(recomputed, ranges):
-    """NaN, infinities and ranges upside down."""
+    (math.nan, {}), (math.inf, {}), (1.0, {'error': math.nan})])
+def test_rows_without_a_number_are_refused(recomputed, ranges):
     with pytest.raises(ValueError, match='x: '):
         row('1', recomputed, **ranges)
 
