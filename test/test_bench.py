@@ -243,13 +243,6 @@ def test_arrays_beyond_any_supply_are_dropped_as_from_a_file(command):
     assert 'usable samples' in said or 'dropped' in said
 
 
-def test_the_namespace_is_light():
-    """A name of a folder would hide a function, whichever is loaded first."""
-    import ou_monitor.analysis.coupling  # noqa: F401
-
-    assert ou_monitor.coupling is coupling
-
-
 @pytest.mark.parametrize('call, words', [
     (lambda: design(FLIGHT), 'got a str: pass a Recording or a path as recording='),
     (lambda: design(Recording([0.0, 1.0], [5.0, 5.1])), 'got a Recording: pass'),

@@ -1,6 +1,8 @@
 """The documents name only existing files, links, options and keys, and their examples run."""
 
+import ast
 import importlib.util
+import json
 from pathlib import Path
 import re
 
@@ -8,6 +10,7 @@ from ou_monitor.analysis.crafts import CELL_LIMIT, pack_limit
 from ou_monitor.cli.commands import COMMANDS
 from ou_monitor.cli.main import main
 from ou_monitor.nodes import replay
+from ou_monitor.stream.config import load_msg_config
 from project import metadata, ROOT
 import pytest
 
@@ -265,3 +268,81 @@ def test_the_limit_is_documented_as_it_is():
         options = [n for one in COMMANDS[name].options if not isinstance(one, tuple)
                    for n in one.names]
         assert {'--cells', '--brownout-voltage'} <= set(options), name
+
+
+NOTEBOOK = ROOT / 'doc/recording_in_python.ipynb'
+
+
+def test_the_notebook_runs_and_its_answers_are_those_of_the_recording(monkeypatch):
+    monkeypatch.chdir(NOTEBOOK.parent)
+    shown = []
+    space = {'display': shown.append}
+    book = json.loads(NOTEBOOK.read_text(encoding='utf-8'))
+    assert book['nbformat'] == 4 and len({cell['id'] for cell in book['cells']}) == len(
+        book['cells'])
+    for cell in book['cells']:
+        if cell['cell_type'] != 'code':
+            continue
+        assert cell['outputs'] == [] and cell['execution_count'] is None
+        tree = ast.parse(''.join(cell['source']))
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, NOTEBOOK.name, 'exec'), space)
+        if last is not None:
+            shown.append(eval(compile(ast.Expression(last.value), NOTEBOOK.name, 'eval'), space))
+    assert any('<svg' in found._repr_html_() for found in shown if hasattr(found, '_repr_html_'))
+    recording, analysis = space['recording'], space['analysis']
+    assert analysis.supply.lowest.voltage_v == recording.voltage.min()
+    assert 'load_sag' in [cause.name for cause in space['finding'].causes]
+    assert space['drawn'].duration == pytest.approx(recording.duration, abs=0.01)
+    assert space['drawn'].voltage.mean() == pytest.approx(recording.voltage.mean(), abs=0.1)
+    assert shown[-1].explained > 0.9
+
+
+AUTOPILOTS = page('autopilots.md')
+
+
+@pytest.mark.parametrize('block', re.findall(
+    r'```yaml\n(description:.*?)```', AUTOPILOTS, re.DOTALL))
+def test_a_description_loads(block, tmp_path):
+    path = tmp_path / 'own.yaml'
+    path.write_text(block, encoding='utf-8')
+    found = load_msg_config(path)
+    assert found.voltage.topic and found.throttle is not None and found.throttle.topic
+
+
+class Port:
+    """A serial port with what a flight controller sends."""
+
+    def __init__(self, volts, amps, motors, broken=False):
+        """Keep it: V, A, and 1000 to 2000."""
+        self.analog = bytes((int(10 * volts), 0, 0, 0, 0)) + round(100 * amps).to_bytes(
+            2, 'little', signed=True) + round(100 * volts).to_bytes(2, 'little')
+        self.motors = b''.join(one.to_bytes(2, 'little') for one in motors)
+        self.broken, self.rest = broken, b''
+
+    def write(self, data):
+        assert data[:3] == b'$M<' and data[3] ^ data[4] == data[5]
+        payload = {110: self.analog, 104: self.motors}[data[4]]
+        check = len(payload) ^ data[4]
+        for byte in payload:
+            check ^= byte
+        self.rest = b'$M>' + bytes((len(payload), data[4])) + payload + bytes(
+            ((check + self.broken) % 256,))
+
+    def read(self, size):
+        found, self.rest = self.rest[:size], self.rest[size:]
+        return found
+
+    def reset_input_buffer(self):
+        self.rest = b''
+
+
+def test_betaflight_msp_is_decoded():
+    """Volts, amperes and the mean of the motors that are there; a broken answer is none."""
+    code = re.search(r'```python\n(import struct.*?)```', AUTOPILOTS, re.DOTALL)[1]
+    space = {}
+    exec(compile(code, 'autopilots.md', 'exec'), space)
+    volts, amps, throttle = space['supply'](Port(15.87, 23.4, (1500, 1600, 1400, 1500, 0, 0)))
+    assert (volts, amps, throttle) == pytest.approx((15.87, 23.4, 0.5))
+    assert space['supply'](Port(15.87, -1.0, (1000,) * 4)) == pytest.approx((15.87, -1.0, 0.0))
+    assert space['supply'](Port(15.87, 1.0, (1500,) * 4, broken=True)) is None
