@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 import re
-import subprocess
 import sys
 
 from project import ROOT
@@ -196,16 +195,3 @@ def test_each_stage_is_made_in_its_place(kind, homes):
 def test_a_wrong_import_is_found(module, source):
     """Each kind of leak is one finding: the checker can fail."""
     assert len(wrong_imports(source, module)) == 1
-
-
-@pytest.mark.parametrize('statement', [
-    'import ou_monitor; ou_monitor.SlidingEstimator',
-    'import ou_monitor.cli.main',
-])
-def test_no_ros_and_no_mcap_until_needed(statement):
-    """The core and the command line start without ROS and without the bag reader."""
-    heavy = ('rclpy', 'mcap', 'matplotlib')
-    code = f'{statement}\nimport sys\nprint([m for m in {heavy} if m in sys.modules])'
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout.strip()) == (0, '[]'), done.stderr

@@ -176,21 +176,6 @@ def test_filter_laws_are_listed():
     assert set(re.findall(r'^\| `(\w+)` \|', section, re.MULTILINE)) == set(LAWS)
 
 
-def test_filter_numbers_are_those_of_the_laws():
-    """Noise taken off between 150 and 20 Hz, and lags."""
-    import math
-
-    from ou_monitor.online.filter.cutoff import supply_noise
-    from ou_monitor.online.filter.filter_state import cutoff_for_lag
-    off = {mode: 1.0 - math.sqrt(supply_noise(mode, 2, 20.0, 63.0)
-                                 / supply_noise(mode, 2, 150.0, 63.0))
-           for mode in ('lowpass', 'derivative')}
-    # 15 % for order 2 and 16 % for order 1; 73 % and 69 % of the derivative.
-    assert off == {'lowpass': pytest.approx(0.15, abs=0.01),
-                   'derivative': pytest.approx(0.7, abs=0.04)}
-    assert [round(cutoff_for_lag(2, lag, 10.0), 1) for lag in (45.0, 20.0)] == [19.3, 41.3]
-
-
 def test_python_example_of_the_readme_runs(monkeypatch):
     """It estimates a bag of the library, whose sigma is known."""
     monkeypatch.chdir(ROOT)

