@@ -615,7 +615,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
 
     """
     from ou_monitor.recordings.write import write_recording
-    from ou_monitor.report.simulation_document import simulation_document
+    from ou_monitor.report.analysis_document import simulation_document
     from ou_monitor.simulation import plan
 
     run = plan(model, preset=preset, throttle=throttle, start=start, end=end, duration=duration,

@@ -9,7 +9,7 @@ import re
 from ou_monitor.analysis.crafts import CELL_LIMIT, pack_limit
 from ou_monitor.cli.commands import COMMANDS
 from ou_monitor.cli.main import main
-from ou_monitor.nodes import replay
+from ou_monitor.nodes.__main__ import replay_options
 from ou_monitor.stream.config import load_msg_config
 from project import metadata, ROOT
 import pytest
@@ -129,7 +129,7 @@ def test_executables_exist(capsys):
         assert scripts[name] == f'ou_monitor.nodes.__main__:{name}'
     line = next(line for line in README.splitlines() if 'run ou_monitor replay' in line)
     with pytest.raises(SystemExit):
-        replay.options(['--help'])
+        replay_options(['--help'])
     shown = capsys.readouterr().out
     assert all(option in shown for option in re.findall(r'--\w+', line))
 

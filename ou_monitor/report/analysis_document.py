@@ -1,9 +1,11 @@
-"""The report of `analyze`: facts, cautions, the paper's tables, and their evidence."""
+"""The reports of `analyze` (facts, cautions, the paper's tables, evidence) and of `simulate`."""
 
 from __future__ import annotations
 
 from collections import Counter
 import math
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
@@ -21,6 +23,9 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN, worst_first)
 from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import chance, counted, listed, number, percent
+
+if TYPE_CHECKING:
+    from ou_monitor.simulation import Run
 
 # Maximum lines of a table on a terminal.
 _MOST_LINES = 12
@@ -513,3 +518,24 @@ def _shape(analysis: Analysis) -> list[Part]:
     if extra > 0:
         text += f' The {extra} shortest levels are in the tables only.'
     return [Pair(figures), Text(text, legend=True)]
+
+
+def simulation_document(run: Run, output: str | Path | None = None) -> Document:
+    """Return the report of a simulation; `output` is the bag, if one was written."""
+    terms = run.file.model.terms
+    said = (f"{run.n} samples of '{run.name}', {run.duration:g} s at {run.rate:g} Hz, "
+            f"{', '.join(term.NAME for term in terms)}; seed {run.seed}")
+    return Document(
+        'Simulation', f'{output or run.name}: {said}', [said], [
+            lambda: [Figure(voltage_plot(run.recording, NAN)),
+                     Figure(Plot(*(('Current', 'time, s', 'A') if run.file.model.full_current else
+                                   ('Throttle', 'time, s', 'throttle')), height=160).line(
+                         run.recording.t, run.load, '', 2))],
+            Facts([(term.NAME, ', '.join(f'{name} {_words(value)}' for name, value in
+                                         term.values().items())) for term in terms])])
+
+
+def _words(value: object) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_words, value))}]"
+    return f'{value:.4g}' if isinstance(value, float) else str(value)

@@ -8,8 +8,8 @@ from live import BAGS, refusal, seconds, wait_until
 from made_bags import encode
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.nodes.__main__ import replay_options
 from ou_monitor.nodes.player import Player, Prefetch, SpacingError
-from ou_monitor.nodes.replay import options
 from ou_monitor.recordings.bag import BagReader, BagWriter
 from ou_monitor.recordings.standard_types import FLOAT32
 import pytest
@@ -205,7 +205,7 @@ def test_log_times_beyond_the_clock_are_handled(world, numbered):
     ([BAG, '--topics', '/volage'], "did you mean '/voltage'?"),
 ], ids=lambda value: '' if isinstance(value, list) else value[:20])
 def test_bad_bags_are_refused_with_the_reason(tmp_path, arguments, words):
-    chosen = options([str(a(tmp_path) if callable(a) else a) for a in arguments])
+    chosen = replay_options([str(a(tmp_path) if callable(a) else a) for a in arguments])
     assert words in refusal(lambda: Player('ou_replay', BagReader(chosen.bag), chosen))
 
 
@@ -219,7 +219,7 @@ def test_bad_bags_are_refused_with_the_reason(tmp_path, arguments, words):
     (['bag', '--lop'], 'unrecognized arguments: --lop')])
 def test_options_that_are_refused(arguments, words):
     with pytest.raises(InputError, match=words):
-        options(arguments)
+        replay_options(arguments)
 
 
 def test_types_that_are_not_installed_are_left_out(world, tmp_path):
