@@ -68,11 +68,13 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
     of_supply = found.seen and not (found.signal_leads or found.narrow)
     advice = f'coupling: {number(abs(found.gain))}' if of_supply else (
         'adapting the cutoff to sigma does not help this signal')
+    random = ('; this peak is larger, but random sign changes of the signal often give as much'
+              if not found.seen and found.coherence[peak] > found.threshold else '')
     return [*lines, ('For the filter', advice),
             ('Chance', f'{p_words(found.p_value)}; detected if below {chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
              f'{number(found.frequency[peak])} Hz; in Gaussian noise by chance up to '
-             f'{number(found.threshold)}')]
+             f'{number(found.threshold)}{random}')]
 
 
 def _signal(recording: Recording, signal: tuple[FloatArray, FloatArray], name: str, unit: str
