@@ -198,13 +198,6 @@ def test_elements_lie_at_multiples_of_their_size():
     assert Scan([parse_element('a', 0, 'le:u16/16')]).size == 2
 
 
-def test_raw_counts_become_volts():
-    """(raw + offset) * scale is in mV."""
-    scan = Scan([parse_element('in_voltage0', 0, 'le:s16/16')])
-    data = np.array([-100, 1000], '<i2').tobytes()
-    assert scan.volts(data, 'in_voltage0', 2.5, 100.0) == pytest.approx([0.0, 2.75])
-
-
 @pytest.mark.parametrize('kind, words', [
     ('le:s12', 'not of the form'), ('xx:s12/16', 'not of the form'),
     ('le:s24/24', 'bits of storage'), ('le:s16/16X2', 'without repetition'),

@@ -263,8 +263,7 @@ def shapes(count):
 
 
 @pytest.mark.parametrize('frames', [
-    20 * ['', 'base_link', 'bat', 'base_linl'], shapes(40), ['été', 'ete', '\u4e2d'] * 20],
-    ids=['alike', 'unlike', 'not ASCII'])
+    20 * ['', 'base_link', 'bat', 'été'], shapes(40)], ids=['alike', 'unlike'])
 def test_frames_of_any_length(frames):
     messages = [battery(frame, k + 0.5, (3.7,) * (k % 3), (k, k))
                 for k, frame in enumerate(frames)]

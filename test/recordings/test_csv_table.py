@@ -54,12 +54,6 @@ def test_a_current_that_most_voltages_lack_is_held(tmp_path, blank, held):
     assert current[30] == 1.0
 
 
-def test_missing_throttle_is_unknown(tmp_path):
-    recording = read_recording(written(tmp_path, 'time_s,voltage_v\n0,5\n1,5.5\n'))
-    assert not recording.has_throttle
-    assert recording.n == 2
-
-
 @pytest.mark.parametrize('text, words', [
     ('', ['empty', 'time_s,voltage_v']),
     ('# only\n\n', ['empty']),

@@ -295,17 +295,6 @@ def test_endless_message_is_refused(tmp_path, definition, data):
         'definition cannot be read' in line)
 
 
-def test_identifiers_are_decoded(tmp_path):
-    """The honest type with such an array, in the middle of others."""
-    definition = f'a/T[] many\nfloat64 data\n{LONG}uint8[16] uuid\nuint32 n\n'
-    data = struct.pack('<4xI16sI16sI4xd', 2, b'a' * 16, 1, b'b' * 16, 2, 5.0)
-    path = by_hand(tmp_path / 'a.mcap', chunk(
-        schema('a/msg/M', definition) + channel()
-        + message(0, b'\x00\x01\x00\x00' + data[4:])))
-    for field, value in (('many[0].n', 1.0), ('many[1].n', 2.0), ('data', 5.0)):
-        assert read_signal(path, f'/voltage/{field}').values.tolist() == [value]
-
-
 @pytest.mark.parametrize('junk', [
     record(0x80), record(Op.CHUNK), record(Op.METADATA, text('a'), text('')) + message(0, b'x', 9),
     message(0, bytes(12)) + record(0x80)], ids=['private', 'broken', 'undefined', 'runs'])

@@ -1,7 +1,5 @@
 """Bags with all options of writing, read whole and in part: always the same samples."""
 
-import itertools
-
 from made_bags import write
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
@@ -131,17 +129,6 @@ def test_a_part_equals_that_part_of_the_whole(tmp_path, start, end, stamped):
     # A throttle from after the part has no say.
     same(part, expect)
     assert any('Only the part from' in note for note in part.notes)
-
-
-def test_parts_side_by_side_are_the_whole(tmp_path):
-    path = write(tmp_path / 'bag.mcap', [row for row in flight(stamped=False)
-                                         if row[0] != '/voltage' or row[2] % 3])
-    edges = [0.0, 0.02, 0.7, 0.71, 1.9, 2.6, None]
-    parts = [read_recording(path, start=a, end=b) for a, b in itertools.pairwise(edges)]
-    whole = read_recording(path)
-    t = np.concatenate([part.t for part in parts])
-    np.testing.assert_array_equal(t, whole.t)
-    np.testing.assert_array_equal(np.concatenate([p.throttle for p in parts]), whole.throttle)
 
 
 @pytest.mark.parametrize('start, end, words', [

@@ -234,14 +234,6 @@ def test_counters_of_repeats():
     assert e.n <= 510 and Flag.HELD_SAMPLES in e.flags
 
 
-def test_no_sample_is_dropped_without_repeats():
-    """A coarse ADC of 2 increments, and the clean rail: no sample is dropped."""
-    rng = np.random.default_rng(9)
-    for code in (2.0 * INCREMENT, 1e-6):
-        y = code * np.round(paths(rng, 1, 4000)[0] / code)
-        assert estimate(stamps(4000), y).counters == Counters(pushed=4000, used=4000)
-
-
 def test_a_fast_logger_is_thinned_after_its_repeats_are_dropped():
     """25 kHz of a 1 kHz source: means of repeats would make sigma wrong."""
     rng = np.random.default_rng(10)
@@ -331,25 +323,6 @@ def test_periods_by_the_gaps(gaps, period):
         # The odd ones are left out.
         period = (57 * 5 + (9 if abs(3 - 5) <= 1.75 else 0)) / 57
     assert found == pytest.approx(period)
-
-
-@pytest.mark.parametrize('odd, kept', [(4, True), (5, False)])
-def test_a_known_period_is_kept_while_eight_in_ten_gaps_are_regular(odd, kept):
-    """3.5 of 10 samples off are regular, 4 are not; those do not count in the mean."""
-    found = refresh_period(series([10] * (20 - odd) + [14] * odd), 10.0)
-    assert (found == 10.0) is kept
-    assert refresh_period(series([10] * 16 + [13] * 4), 10.0) == pytest.approx(10.6)
-    assert refresh_period(series([2] * 15 + [5] * 5), 2.0) == pytest.approx(55 / 25)
-
-
-@pytest.mark.parametrize('same, found', [(90, 5.0), (91, 1.0)])
-def test_a_tenth_of_the_steps_has_another_size(same, found):
-    # Counted is what lies between two changes: the first step of all included.
-    sizes = [1.0, 1.0005] * 46
-    steps = np.array([*sizes[:same], *[2.0 + 0.01 * k for k in range(100 - same)]])
-    steps = np.random.default_rng(1).permutation(steps) * np.resize((1.0, -1.0), 100)
-    y = np.repeat(np.concatenate(([0.0], np.cumsum(steps))), 5)
-    assert refresh_period(y) == found
 
 
 @pytest.mark.parametrize('depends, size', [(np.abs, True), (lambda u: 0.5 * (u + 1.0), False)])

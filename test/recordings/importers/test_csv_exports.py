@@ -86,6 +86,10 @@ FORMS = {
     'siglent': (table(['Record Length,Analog:60', 'Sample Interval,CH1:1.00E-5', 'Vertical Units,'
                        'CH1:V', 'Model Number,SDS1104', 'Source,CH1', 'Second,Volt'],
                       lambda k: f'{1e-5 * k:.7f},{V[k]:.3f}'), 1e-5, False, False),
+    # A fact with a decimal number above names that are units.
+    'siglent_scale': (table(
+        ['Record Length,Analog:60', 'Horizontal Scale, 0.500000000', 'Second,Volt'],
+        lambda k: f'{1e-5 * k:.11f},{V[k]:.5f}'), 1e-5, False, False),
     'rohde': (table(['in s,CH1 in V'], lambda k: f'{1e-5 * k:.6E},{V[k]:.4E}'), 1e-5, False,
               False),
     'picoscope': (table(['Time,Channel A', '(ms),(mV)', ''],
@@ -446,6 +450,8 @@ FORMS = {
         ['"Model Name","WT1800"', '', 'Store No.,Date,Time,Millisecond,U-1-Udc,I-1-Idc,P-1'],
         lambda k: f"{k},{clock(k, '%Y/%m/%d,%H:%M:%S', 0.1)},{100 * k % 1000},{V[k]},{AMPS[k]},1"),
         0.1, False, True),
+    'power_meter': (table(['Store No.,Time,Urms-1,Irms-1,P-1'], lambda k: (
+        f'{k},{0.1 * k:.1f},{V[k]},{AMPS[k]},43')), 0.1, False, True),
     'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
         f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
     # Points between thousands, shown by the unit, the time or commas elsewhere.
@@ -582,16 +588,6 @@ def test_a_name_at_the_left_of_each_number_names_its_column(tmp_path):
     np.testing.assert_allclose(read_recording(path).voltage, V)
 
 
-def test_a_fact_with_a_decimal_number_does_not_name_the_columns(tmp_path):
-    """The line below it is of names, which are units."""
-    found = read_recording(written(tmp_path, table(
-        ['Record Length,Analog:60', 'Horizontal Scale, 0.500000000', 'Second,Volt'],
-        lambda k: f'{1e-5 * k:.11f},{V[k]:.5f}')))
-    np.testing.assert_allclose(found.voltage, V)
-    np.testing.assert_allclose(found.t, 1e-5 * K, atol=1e-9)
-    assert found.source['voltage'] == 'Volt'
-
-
 def test_a_battery_state_without_a_header_keeps_the_sign_of_its_current(tmp_path):
     """Its charge, which rises here, is not taken for the time, nor its nanoseconds for stamps."""
     found = read_recording(written(tmp_path, table([], lambda k: (
@@ -667,6 +663,7 @@ def test_a_date_and_a_clock_are_one_time(tmp_path):
     ('P [W]', {'throttle': 'P [W]'}, "the unit 'w': name a column of throttle"),
     ('dt (s)', {'throttle': 'dt (s)'}, r'a unit of time \(--time-column\)'),
     ('soc (%)', {'voltage': 'soc (%)'}, 'a unit of throttle .* or give --unit'),
+    ('Current(uA)', {'voltage': 'Current(uA)'}, 'a unit of current'),
     ('U2 [mV]', {'current': 'U2 [mV]'}, 'a unit of voltage .* name a column of current$')])
 def test_a_named_column_of_another_quantity_is_refused(name, given, words, tmp_path):
     """Unless its unit or ends are given."""
@@ -676,6 +673,9 @@ def test_a_named_column_of_another_quantity_is_refused(name, given, words, tmp_p
     if 'throttle' in given:
         found = read_recording(path, columns=CsvColumns(throttle_unit='0:0.5', **given))
         np.testing.assert_allclose(found.throttle, 2.0 * U)
+    elif 'voltage' in given:
+        found = read_recording(path, columns=CsvColumns(unit='V', **given))
+        np.testing.assert_allclose(found.voltage, U)
 
 
 @pytest.mark.parametrize('kind, words', [
@@ -873,22 +873,6 @@ def test_words_of_loggers_for_a_missing_number(tmp_path):
     found = read_recording(written(tmp_path, 'time,VBAT (x10 mV)\n' + ''.join(
         f'{k},{word}\n' for k, word in enumerate(['1200', *words, '1210']))))
     assert found.voltage.tolist() == [12.0, pytest.approx(12.1)]
-
-
-def test_columns_of_a_power_meter(tmp_path):
-    """Names such as Urms-1 and Irms-1 are of one channel; power is not read."""
-    found = read_recording(written(
-        tmp_path, 'Store No.,Time,Urms-1,Irms-1,P-1\n1,0.0,12.5,3.5,43\n2,0.1,12.4,4.5,55\n'))
-    assert found.voltage.tolist() == [12.5, pytest.approx(12.4)]
-    assert found.current is not None and found.current.tolist() == [3.5, 4.5]
-
-
-def test_a_current_is_not_read_as_a_voltage(tmp_path):
-    """A power profiler exports only a current; a unit that is given overrules its header."""
-    path = written(tmp_path, 'time_s,Current(uA)\n0,12\n1,13\n')
-    with pytest.raises(InputError, match=r"'Current\(uA\)' has a unit of current"):
-        read_recording(path, columns=CsvColumns(voltage='Current(uA)'))
-    read_recording(path, columns=CsvColumns(voltage='Current(uA)', unit='mV'))
 
 
 @pytest.mark.parametrize('order', ['one after another', 'equal stamps', 'in turn'])
