@@ -247,10 +247,9 @@ class McapFile:
             return {}
         # With `partial` the statistics of the summary are not trusted.
         stated = None if partial else summary.statistics
-        if stated is not None and bool(spans) == bool(stated.message_count) == bool(
-                stated.channel_message_counts) and sum(
-                    stated.channel_message_counts.values()) == stated.message_count and (
-                        stated.channel_message_counts.keys() <= summary.channels.keys()):
+        if stated is not None and bool(spans) == bool(stated.channel_message_counts) and (
+                sum(stated.channel_message_counts.values()) == stated.message_count) and (
+                    stated.channel_message_counts.keys() <= summary.channels.keys()):
             self._trusted = True
             self._schemas.update(summary.schemas)
             for channel in summary.channels.values():

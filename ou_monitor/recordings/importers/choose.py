@@ -46,7 +46,11 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     """Choose series, drop unusable samples (option: pattern of option names, for errors)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
-        raise InputError(_no_voltage(path, log, option))
+        others = _series_of(log, VOLTAGE) + _series_of(log, ANY)
+        raise InputError(f'{path} ' + (
+            f'has no battery voltage; choose another with {option.format(VOLTAGE)} NAME: '
+            f'{_names_of(others)}' if others else 'holds no voltage')
+            + ''.join(f' ({note})' for note in log.notes))
     first = _pick(path, log, THROTTLE, throttle, option)
     if first is not None and log.format == 'csv':
         # The scale of a CSV column is not stated; importers of autopilot logs know theirs.
@@ -163,15 +167,6 @@ def _current(log: Log, voltage: Series) -> Series | None:
         return beside[0]
     batteries = [one for one in _series_of(log, VOLTAGE) if one.rank is not None]
     return ranked[0] if len(ranked) == 1 and len(batteries) < 2 else None
-
-
-def _no_voltage(path: Path, log: Log, option: str) -> str:
-    others = _series_of(log, VOLTAGE) + _series_of(log, ANY)
-    why = ''.join(f' ({note})' for note in log.notes)
-    if others:
-        return (f'{path} has no battery voltage; choose another with {option.format(VOLTAGE)} '
-                f'NAME: {_names_of(others)}{why}')
-    return f'{path} holds no voltage{why}'
 
 
 def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
