@@ -9,7 +9,6 @@ have exhausted the memory, so each is tried once more, alone.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -52,27 +51,16 @@ def usable_cores() -> int:
         os.cpu_count() or 1)
 
 
-class Workers(ABC):
+class Workers:
     """Processes that call a function; a context manager."""
 
-    # Errors of a task whose worker died.
+    # Of each kind: errors of a task whose worker died; how many tasks may run; start a call, and
+    # return its future; wait for one of some futures, and return those that are done.
     _deaths: tuple[type[Exception], ...]
-
-    @abstractmethod
-    def _room(self) -> int:
-        """Return the maximum number of running tasks."""
-
-    @abstractmethod
-    def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        """Start a call; return its future."""
-
-    @abstractmethod
-    def _wait(self, futures: Sequence[Any]) -> list[Any]:
-        """Wait until a future is done; return all finished ones."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Cancel the running tasks, and release the workers."""
+    _room: Callable[[], int]
+    _submit: Callable[[Callable[..., Any], tuple[Any, ...]], Any]
+    _wait: Callable[[Sequence[Any]], list[Any]]
+    close: Callable[[], None]
 
     def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]
              ) -> Iterator[Outcome]:
@@ -191,19 +179,15 @@ def _prepare(watched: Connection, memory: int) -> None:
 def check_address(address: str, insecure: bool = False) -> None:
     """Raise InputError if others can read and change the connection to a scheduler."""
     parts = urlsplit(address if '://' in address else f'tcp://{address}')
-    if insecure or parts.scheme == 'tls' or _is_loopback(parts.hostname or ''):
+    if insecure or parts.scheme == 'tls' or parts.hostname == 'localhost':
         return
+    with suppress(ValueError):
+        if ipaddress.ip_address(parts.hostname or '').is_loopback:
+            return
     raise InputError(
         f"--scheduler: '{address}' is not encrypted: anyone on that network can run programs "
         'on its workers and on this machine. Use tls://HOST:PORT, or --insecure on a network '
         'that nobody else can reach')
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == 'localhost' or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 class ClusterWorkers(Workers):
