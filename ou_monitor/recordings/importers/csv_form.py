@@ -15,12 +15,11 @@ from __future__ import annotations
 from array import array
 import codecs
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import csv
-from functools import partial
 import io
-from itertools import chain, islice
+from itertools import accumulate, chain, islice
 import math
 from pathlib import Path
 import re
@@ -571,29 +570,26 @@ def numbers(path: Path, form: Form, places: Sequence[int],
     try:
         with opened(path) as raw, io.TextIOWrapper(raw, form.encoding, (
                 'strict' if form.encoding.startswith('utf') else 'replace'), None) as file:
-            for begin, block in _blocks(path, file, form, width):
-                rows = block
+            for lines, rows in _blocks(path, file, form, width):
                 if len(rows[0]) <= last or len(rows[0]) > width or len(set(map(len, rows))) > 1:
-                    rows = _fitting(path, rows, width, last, form, begin, left_out)
+                    lines, rows = _fitting(path, lines, rows, width, last, form, left_out)
                 columns: list[tuple[str, ...]] = list(zip(*(
                     _unlabelled(row, form.labels) for row in rows)))
                 if not columns:
                     continue
                 good = np.ones(len(rows), dtype=bool)
                 for place, part in zip(places, parts):
-                    where = partial(_place, path, form, place, begin, block)
                     cells = columns[place]
                     if only:
                         cells = tuple(cell if name in only[1] or is_number(cell) else 'nan'
                                       for cell, name in zip(cells, columns[only[0]]))
                     if place in with_unit:
                         cells = _with_units(cells, columns[place + 1], form.units[place])
-                    part.append(_floats(cells, where, form.comma, form.units[place],
+                    part.append(_floats(path, lines, cells, form, place,
                                         good if left_out is not None else None, left_out))
                 if not good.all():
                     for k in np.flatnonzero(~good).tolist():
-                        _check_same_names(rows[k], form.names, partial(
-                            _place, path, form, begin=begin, rows=block, k=k))
+                        _check_same_names(f'{path}:{lines[k]}', rows[k], form.names)
                     for part in parts:
                         part[-1] = part[-1][good]
                 for place, text in (texts or {}).items():
@@ -605,15 +601,16 @@ def numbers(path: Path, form: Form, places: Sequence[int],
     return [np.concatenate(part) if part else np.empty(0) for part in parts]
 
 
-def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int], str]) -> None:
+def _check_same_names(where: str, row: list[str], names: Sequence[str]) -> None:
     """Raise InputError if a bad line is a header that begins another table."""
     cells = [cell.strip() for cell in row]
     others = [k for k, (cell, name) in enumerate(zip(cells, names)) if cell != name]
     if others and not any(map(is_value, cells)) and (
             set(cells) & {*names} - {''} or len({*cells}) == len(cells) > 1 and all(
                 cell[:1].isalpha() and not is_missing(cell) for cell in cells)):
-        raise InputError(f"{where(others[0])} becomes '{shown(cells[others[0]])}': another table "
-                         'begins there; move it to a file of its own')
+        raise InputError(f"{where}: column '{names[others[0]]}' becomes "
+                         f"'{shown(cells[others[0]])}': another table begins there; move it to a "
+                         'file of its own')
 
 
 def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
@@ -624,31 +621,33 @@ def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tupl
 
 
 def _blocks(path: Path, file: TextIO, form: Form, width: int,
-            ) -> Iterator[tuple[int, list[list[str]]]]:
-    """Yield rows, with the number of the line before the first of them."""
-    lines = islice(chain.from_iterable(_lines(path, file, form)), form.skip, None)
-    reader = csv.reader(lines, delimiter=form.delimiter, strict=True, skipinitialspace=True)
+            ) -> Iterator[tuple[Sequence[int], list[list[str]]]]:
+    """Yield rows, with the numbers of the lines in which they end."""
+    text = islice(chain.from_iterable(_lines(path, file, form)), form.skip, None)
+    reader = csv.reader(text, delimiter=form.delimiter, strict=True, skipinitialspace=True)
     while True:
-        before = reader.line_num
+        before = form.skip + reader.line_num
         try:
             rows = list(islice(reader, _BLOCK))
-            if form.comma and form.delimiter == ',':
-                rows = [_joined(row, width) or list(map(_with_point, row)) for row in rows]
         except csv.Error as error:
             raise InputError(f'{path}:{form.skip + reader.line_num}: {error}: close each quote '
                              'in its line') from error
         if not rows:
             return
+        lines: Sequence[int] = range(before + 1, before + 1 + len(rows))
+        if form.skip + reader.line_num > lines[-1]:
+            lines = list(accumulate((1 + sum(cell.count('\n') for cell in row) for row in rows),
+                                    initial=before))[1:]
+            for line, row in zip(lines, rows):
+                if any(part.count(form.delimiter) >= width - 1
+                       for cell in row for part in cell.splitlines()[1:]):
+                    raise InputError(f'{path}:{line}: whole lines before this one are within a '
+                                     'quote: close each quote in its line')
+        if form.comma and form.delimiter == ',':
+            rows = [_joined(row, width) or list(map(_with_point, row)) for row in rows]
         if form.indent:
             rows = [_of_table(row, form.indent) for row in rows]
-        if reader.line_num - before > len(rows):
-            for k, row in enumerate(rows):
-                if any(line.count(form.delimiter) >= width - 1
-                       for cell in row for line in cell.splitlines()[1:]):
-                    raise InputError(
-                        f'{path}:{_line(form.skip + before, rows, k)}: whole lines before this '
-                        'one are within a quote: close each quote in its line')
-        yield form.skip + before, rows
+        yield lines, rows
 
 
 def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
@@ -667,14 +666,10 @@ def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
         yield _prepared([rest], form.delimiter, form.comma, form.mark)
 
 
-def _line(before: int, rows: list[list[str]], k: int) -> int:
-    """Return the number of the line where a row of a block ends."""
-    return before + k + 1 + sum(cell.count('\n') for row in rows[:k + 1] for cell in row)
-
-
-def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: Form, begin: int,
-             left_out: list[str] | None) -> list[list[str]]:
-    """Return the rows that are not blank, all of one width."""
+def _fitting(path: Path, lines: Sequence[int], rows: list[list[str]], width: int, last: int,
+             form: Form, left_out: list[str] | None) -> tuple[Sequence[int], list[list[str]]]:
+    """Return the rows that are not blank, all of one width, and their lines."""
+    kept: list[int] = []
     for k, row in enumerate(rows):
         wrong, blank = '', not any(cell.strip() for cell in row)
         if any(cell.strip() for cell in row[width:]):
@@ -683,19 +678,18 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
         elif not blank and len(row) <= last:
             wrong = f"the line ends before column '{form.names[last]}'"
         if wrong:
-            wrong = f'{path}:{_line(begin, rows, k)}: {wrong}'
+            wrong = f'{path}:{lines[k]}: {wrong}'
             if left_out is None:
                 raise InputError(wrong + _PARTIAL)
             left_out.append(wrong)
-        if wrong or blank:
-            # Keep the row, emptied, so that lines are still counted.
-            row.clear()
-    return [row[:last + 1] for row in rows if row]
+        elif not blank:
+            kept.append(k)
+    return [lines[k] for k in kept], [rows[k][:last + 1] for k in kept]
 
 
-def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stated: str,
+def _floats(path: Path, lines: Sequence[int], cells: Sequence[str], form: Form, place: int,
             good: npt.NDArray[np.bool_] | None, left_out: list[str] | None) -> FloatArray:
-    """Return cells as numbers (where: states the place of a cell; stated: their unit)."""
+    """Return the cells of a column as numbers."""
     # A bad cell raises InputError; with `good`, its line is marked as bad, and one error appended.
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
@@ -708,15 +702,16 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
     for k, cell in enumerate(cells):
         try:
             value, unit = number_of(cell)
-            value *= _ratio(unit, stated)
+            value *= _ratio(unit, form.units[place])
         except ValueError:
             value = math.nan
         if value != value and not is_missing(cell):
-            if comma:
+            if form.comma:
                 cell = _with_point(cell)
-            mark = ': the decimal mark is a comma (--decimal)' if comma else (
+            mark = ': the decimal mark is a comma (--decimal)' if form.comma else (
                 _MARK * (cell.count(',') == 1))
-            wrong = f"{where(k)} holds '{shown(cell)}', not a number{mark}"
+            wrong = (f"{path}:{lines[k]}: column '{form.names[place]}' holds '{shown(cell)}', not "
+                     f'a number{mark}')
             if good is None or left_out is None:
                 raise InputError(wrong + _PARTIAL * (not mark))
             if good[k]:
@@ -731,10 +726,3 @@ def _ratio(unit: str, stated: str) -> float:
     one, other = WORDS.get(unit, ''), WORDS.get(stated, '')
     return 1.0 if not unit or unit == stated else (
         SCALES[one] / SCALES[other] if one[-1:] == other[-1:] else math.nan)
-
-
-def _place(path: Path, form: Form, place: int, begin: int, rows: list[list[str]], k: int) -> str:
-    """Return the place of a cell in words."""
-    filled = [j for j, row in enumerate(rows) if row]
-    at = _line(begin, rows, filled[k] if k < len(filled) else k)
-    return f"{path}:{at}: column '{form.names[place]}'"
