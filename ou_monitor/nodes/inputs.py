@@ -279,8 +279,9 @@ class SourceFinder:
                         f'{quantity} from {topic}: {chosen.spec.type} field '
                         f"'{chosen.spec.field}' (msg_config '{chosen.config}')")
             elif types:
+                known = [c.spec.type for c in source.candidates if c.spec is not None]
                 problem = (f"{topic} carries {', '.join(types)}, which no generic msg_config "
-                           f"describes (known: {', '.join(source.known_types)}): set "
+                           f"describes (known: {', '.join(dict.fromkeys(known))}): set "
                            f'{quantity}.type and {quantity}.field, or msg_config.')
             if problem and self.problems.get(quantity) != problem:
                 self._node.get_logger().warning(problem, throttle_duration_sec=10.0)

@@ -71,11 +71,6 @@ class Source:
                 return candidate
         return None
 
-    @property
-    def known_types(self) -> list[str]:
-        """Return the message types of the candidates."""
-        return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
-
     def open_many(self) -> tuple[Any, ManyExtractor]:
         """Return the message class and an extractor that reads several numbers of a message."""
         message, spec = self._open()

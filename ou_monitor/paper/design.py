@@ -438,12 +438,6 @@ def _uf(row: DesignRow) -> str:
     return f'{number(1e6 * row.capacitance)} uF'
 
 
-def remarks(result: Design) -> list[str]:
-    return [] if result.falls else [
-        'More capacitance does not always lower the risk here (ESR): choose a value from the '
-        'table.']
-
-
 def probability(value: float) -> str:
     """Return a probability with two digits, or '<1e-12'."""
     return '<1e-12' if 0.0 < value < 1e-12 else number(value, 2)

@@ -229,11 +229,6 @@ class Rail:
         """Mean voltage of the rail, V."""
         return self.load.bus if self.name == 'bus' else self.load.regulated
 
-    @property
-    def source_rates(self) -> FloatArray:
-        """Rates of the noise sources, 1/s, shape (3,), in the order of `SOURCES`."""
-        return np.asarray(-np.diag(self.a)[-len(SOURCES):])
-
     @cached_property
     def covariance(self) -> FloatArray:
         """Stationary covariance of the states, shape (n, n), by Lyapunov's equation."""

@@ -41,15 +41,10 @@ class Printed:
     def __post_init__(self) -> None:
         """Set the rounding error."""
         last = int(Decimal(self.text.lstrip('<>~ ')).as_tuple().exponent)
-        if self.is_bound:
+        if self.text[0] in '<>':
             object.__setattr__(self, 'half_unit', 0.0)
         elif math.isnan(self.half_unit):
             object.__setattr__(self, 'half_unit', float(Decimal((0, (5,), last - 1))))
-
-    @property
-    def is_bound(self) -> bool:
-        """Return whether this is a claim that something is above or below a number."""
-        return self.text[0] in '<>'
 
     @property
     def value(self) -> float:

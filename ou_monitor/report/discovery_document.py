@@ -45,7 +45,10 @@ def discovery_document(finding: Finding, seen: Overview | None = None) -> Docume
                   Section('Gain' if finding.causes else 'What it predicts',
                           _gain(finding)),
                   lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True)],
-                  Section('What is left', [_discrepancies(finding)], folded=True),
+                  Section('What is left', [
+                      _scores(finding, finding.remaining) if finding.remaining else
+                      Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the '
+                           'band.')], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
     parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
     beware = () if seen is None else seen.beware
@@ -154,12 +157,6 @@ def _statistics(finding: Finding) -> list[Part]:
         f'{text}The scores are in standard deviations. The band comes from simulations that are '
         'fitted in the same way: with a correct model, one recording in a hundred has a statistic '
         'outside it.', legend=True)]
-
-
-def _discrepancies(finding: Finding) -> Part:
-    if not finding.remaining:
-        return Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the band.')
-    return _scores(finding, finding.remaining)
 
 
 def _scores(finding: Finding, found: Sequence[Criticism]) -> Table:

@@ -573,8 +573,10 @@ def _drift(fleet: Fleet) -> list[Part]:
     judged = fleet.judgement
     if not judged.trends:
         return [Text('No vehicle has enough flights for a test.')]
-    parts = Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
-                             for t in judged.drifting[:_DRAWN]])
+    parts = Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), (
+        f'{change(t.slope)} per flight; fleet-wide p {chance(t.p_family)}. Values'
+        f'{_at_throttle(judged.values[t.quantity]) or " as measured"}, with 95 % intervals.'))
+        for t in judged.drifting[:_DRAWN]])
     rows = [[t.vehicle, t.quantity, str(t.flights), change(t.slope) + '\n'
              + f'[{change(t.low)}, {change(t.high)}]',
              chance(t.p_value), chance(t.p_family),
@@ -585,12 +587,6 @@ def _drift(fleet: Fleet) -> list[Part]:
         'Straight lines fitted to the logarithms, weighted by the errors; p: t test by the '
         'scatter about the line; fleet-wide p: Holm-adjusted.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
-
-
-def _caption(trend: Trend, fleet: Fleet) -> str:
-    at = _at_throttle(fleet.judgement.values[trend.quantity]) or ' as measured'
-    return (f'{change(trend.slope)} per flight; fleet-wide p '
-            f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:
