@@ -3,7 +3,6 @@
 import math
 
 from chains import CYCLE, moments_of_switched, PAPER, THREE, vector_system
-from convergence import cycle
 import numpy as np
 from ou_monitor.paper.theory import (
     CORRECT_FACTOR, flow, Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem,
@@ -227,20 +226,6 @@ def test_without_balance_the_limit_is_refused(matrices, offsets, message):
     system = SwitchedSystem(Generator.telegraph(1.0, 1.0), matrices, offsets)
     with pytest.raises(ValueError, match=message + '.*move the average'):
         switching_intensity(system, [0.0])
-
-
-def test_the_order_of_the_jumps_matters_to_the_drift():
-    """In a rotating chain A_y A_x and A_x A_y differ: only one of them is the limit."""
-    chain = cycle([1.0, 1.0, 1.0])
-    turn = np.array([[[0.0, 1.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, 0.0]], [[0.0, -1.0],
-                    [-1.0, 0.0]]])
-    system = SwitchedSystem(chain, turn)
-    b = switching_drift(system).matrix
-    weight = chain.stationary[:, None] * chain.potential
-    swapped = np.einsum('xy,xij,yjk->ik', weight, turn, turn)
-    mean, _ = moments_of_switched(system, 1.0, [1.0, 0.5], 0.01, 'diffusion')
-    assert np.abs(mean - expm(b) @ [1.0, 0.5]).max() < 0.02
-    assert np.abs(mean - expm(swapped) @ [1.0, 0.5]).max() > 0.2
 
 
 def test_exact_moments_tend_to_those_of_the_limit():
