@@ -38,33 +38,16 @@ from ou_monitor.records import FloatArray
 from scipy.linalg import expm
 from scipy.sparse.csgraph import connected_components
 
-# Maximum substeps of the series; beyond them the matrix exponential is cheaper.
-_MOST_SUBSTEPS = 32.0
-
-
-def augmented(matrix: npt.ArrayLike, offset: npt.ArrayLike) -> FloatArray:
-    """Return [[A, a], [0, 0]], whose exponential propagates (u, 1) (matrix in 1/s)."""
-    a = np.asarray(matrix, dtype=np.float64)
-    d = a.shape[-1]
-    full = np.zeros((*a.shape[:-2], d + 1, d + 1))
-    full[..., :d, :d] = a
-    full[..., :d, d] = offset
-    return full
-
 
 def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray) -> FloatArray:
     """Move m states along their affine systems (1/s), each for its own time tau, s."""
     # Taylor series of the exponential acting on the state, to double precision, in substeps of
-    # norm at most 1. It needs no eigenvectors, so it handles a defective matrix too. Very long
-    # steps use the matrix exponential.
+    # norm at most 1. It needs no eigenvectors, so it handles a defective matrix too.
     if not u.size:
         return u.copy()
     step = tau[:, None]
     norm = np.abs(matrix).sum(axis=-1).max(axis=-1)
     reach = float(np.max(np.abs(tau) * norm))
-    if not reach <= _MOST_SUBSTEPS:
-        power = expm(augmented(matrix, offset) * tau[:, None, None])
-        return np.asarray((power[:, :-1, :-1] @ u[:, :, None])[..., 0] + power[:, :-1, -1])
     parts = max(1, math.ceil(reach))
     step = step / parts
     reach /= parts
@@ -120,8 +103,11 @@ class AffineSystem:
         times = check_times(t)
         state = check_state(u0, self.offset.size)
         with np.errstate(all='ignore'):
-            power = expm(augmented(self.matrix, self.offset)
-                         * (times - times[0])[:, None, None])
+            # The exponential of [[A, a], [0, 0]] propagates (u, 1).
+            d = self.offset.size
+            full = np.zeros((d + 1, d + 1))
+            full[:d, :d], full[:d, d] = self.matrix, self.offset
+            power = expm(full * (times - times[0])[:, None, None])
             path = np.asarray(power[:, :-1, :-1] @ state + power[:, :-1, -1])
         if not np.isfinite(path).all():
             raise ValueError(
