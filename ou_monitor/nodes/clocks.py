@@ -77,13 +77,11 @@ def line_under(times: Sequence[float] | FloatArray) -> tuple[float, float]:
     at, period = 0, float(stamps[-1]) / (n - 1)
     # Which message of a group is the earliest depends on the slope; three rounds suffice.
     for _ in range(3 if group > 1 else 1):
-        lowest = numbers
-        if group > 1:
-            above = stamps - period * numbers
-            whole = n - n % group
-            lowest = above[:whole].reshape(-1, group).argmin(axis=1) + numbers[:whole:group]
-            if whole < n:
-                lowest = np.append(lowest, whole + int(above[whole:].argmin()))
+        above = stamps - period * numbers
+        whole = n - n % group
+        lowest = above[:whole].reshape(-1, group).argmin(axis=1) + numbers[:whole:group]
+        if whole < n:
+            lowest = np.append(lowest, whole + int(above[whole:].argmin()))
         at, period = _hull_edge(lowest.tolist(), stamps[lowest].tolist())
     above = stamps - (stamps[at] + period * (numbers - at))
     near = above <= max(1.0, NEAR * math.sqrt(n)) * period
