@@ -95,33 +95,27 @@ def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int,
     at = 5
     events: dict[int, _Event] = {}
 
-    def take(size: int) -> int:
-        nonlocal at
-        at += size
-        if at > len(data):
-            raise InputError(f'{path}: the header does not end: the log was cut off')
-        return int.from_bytes(data[at - size:at], 'little')
-
     def text() -> str:
         nonlocal at
-        begin, at = at, data.find(b'\0', at) + 1
-        if not at:
-            raise InputError(f'{path}: the header does not end: the log was cut off')
+        begin, at = at, data.index(b'\0', at) + 1
         return data[begin:at - 1].decode('utf-8', 'replace')
 
-    for _ in range(number):
-        key, name = take(2), text()
-        fields: list[tuple[str, str]] = [('id', '<u2'), ('stamp', stamp)]
-        names = []
-        for k in range(take(2)):
-            variable = text()
-            if variable[-3:-2] != '(' or variable[-2:-1] not in _TYPES or variable[-1:] != ')':
-                raise InputError(f"{path}: the header has no type for '{variable}': it is damaged")
-            names.append(variable[:-3])
-            fields.append((f'v{k}', f'<{variable[-2]}'))
-        if key in events:
-            raise InputError(f'{path}: the header has two events {key}: it is damaged')
-        events[key] = _Event(name, np.dtype(fields), tuple(names))
+    try:
+        for _ in range(number):
+            key, at = int.from_bytes(data[at:at + 2], 'little'), at + 2
+            name, count = text(), int(struct.unpack_from('<H', data, at)[0])
+            at += 2
+            variables = [text() for _ in range(count)]
+            if wrong := [one for one in variables if one[-3:-2] != '(' or one[-2:-1] not in _TYPES
+                         or one[-1:] != ')']:
+                raise InputError(f"{path}: the header has no type for '{wrong[0]}': it is damaged")
+            if key in events:
+                raise InputError(f'{path}: the header has two events {key}: it is damaged')
+            events[key] = _Event(name, np.dtype([('id', '<u2'), ('stamp', stamp), *(
+                (f'v{k}', f'<{one[-2]}') for k, one in enumerate(variables))]), tuple(
+                    one[:-3] for one in variables))
+    except (ValueError, struct.error) as error:
+        raise InputError(f'{path}: the header does not end: the log was cut off') from error
     return events, at
 
 

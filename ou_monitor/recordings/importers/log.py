@@ -213,22 +213,17 @@ def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
     good = np.ones(t.size, dtype=bool)
     if (t[1:] >= t[:-1]).all():
         return good
-    ends: list[float] = []
-    places: list[int] = []
-    before = np.full(t.size, -1, dtype=np.int64)
-    for k, stamp in enumerate(t.tolist()):
-        length = bisect_right(ends, stamp)
-        if length == len(ends):
-            ends.append(stamp)
-            places.append(k)
-        else:
-            ends[length], places[length] = stamp, k
-        before[k] = places[length - 1] if length else -1
+    # For each length, the place where such a sequence ends with the least stamp.
+    stamps, places, before = t.tolist(), list[int](), list[int]()
+    for k, stamp in enumerate(stamps):
+        length = bisect_right(places, stamp, key=stamps.__getitem__)
+        before.append(places[length - 1] if length else -1)
+        places[length:length + 1] = [k]
     good[:] = False
     at = places[-1]
     while at >= 0:
         good[at] = True
-        at = int(before[at])
+        at = before[at]
     return good
 
 
@@ -282,8 +277,7 @@ def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
     """Catch what a parser prints, and turn any failure of it into an `InputError`."""
     said = io.StringIO()
     logger = logging.getLogger(parser)
-    before = logger.disabled, logger.propagate
-    logger.propagate = False
+    before, logger.propagate = logger.propagate, False
     handler = logging.NullHandler()
     logger.addHandler(handler)
     try:
@@ -298,7 +292,7 @@ def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
                          f'({type(error).__name__}: {printable(error, 200)})') from error
     finally:
         logger.removeHandler(handler)
-        logger.disabled, logger.propagate = before
+        logger.propagate = before
 
 
 @contextmanager
