@@ -319,7 +319,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
     def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:
         """Open the target; never overwrite anything."""
         # A file name may contain bytes that are not text, which MCAP and YAML cannot store.
-        self._about = {key: _as_text(value) for key, value in (about or {}).items()}
+        self._about = {key: value.encode('utf-8', 'backslashreplace').decode()
+                       for key, value in (about or {}).items()}
         self.path = Path(path)
         self._folder = None if self.path.suffix == '.mcap' else self.path
         self._mcap = self.path if self._folder is None else (
@@ -444,7 +445,3 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self.close()
         else:
             self._remove()
-
-
-def _as_text(value: str) -> str:
-    return value.encode('utf-8', 'backslashreplace').decode()

@@ -303,7 +303,10 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
             column_values = column_values + sum(np.where(np.isfinite(cell) & (
                 cell != 65535.0), cell, 0.0) for cell in several[1:])
         elif len(several) > 1:
-            column_values = _mean_of_motors(several)
+            # The motors that ever run; one that is stopped counts as 0, as for a ULog.
+            used = np.array([one for one in several if np.isfinite(one).any()] or several[:1])
+            column_values = np.where(np.isfinite(used).any(axis=0),
+                                     np.nansum(used, axis=0) / len(used), np.nan)
         column_values = column_values * factor_of(column.name)
         si, guesses[quantity] = in_si(path, quantity, column, column_values,
                                       units.get(quantity), volts, guesses.get(logs.VOLTAGE, ''))
@@ -337,12 +340,6 @@ def _rest_of_group(form: Form, quantity: str, column: FileColumn, wanted: CsvCol
         return []
     others = re.compile(re.escape(first[1]) + '[1-9]' + re.escape(first[2]))
     return [k for k, name in enumerate(form.names) if others.fullmatch(name)]
-
-
-def _mean_of_motors(values: list[FloatArray]) -> FloatArray:
-    """Average the motors that ever run; while one is stopped, it counts as 0, as for a ULog."""
-    used = np.array([one for one in values if np.isfinite(one).any()] or values[:1])
-    return np.where(np.isfinite(used).any(axis=0), np.nansum(used, axis=0) / len(used), np.nan)
 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:

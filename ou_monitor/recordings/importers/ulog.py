@@ -118,7 +118,8 @@ def read(path: Path, request: Request) -> Log:
     with quiet(path, 'pyulog') as said:
         with _WatchedFile(io.FileIO(path)) as file:
             file.size, file.progress = size, request.progress
-            ulog = ULog(file, None if request.everything else _topics(request.names))
+            ulog = ULog(file, None if request.everything else list(dict.fromkeys(
+                (*TOPICS, *(re.split(r'[.\[]', name)[0] for name in request.names)))))
     notes: list[str] = []
     if file.cut_at is not None:
         notes.append(Note(f'The log was cut off within its last message, at byte {file.cut_at} '
@@ -150,10 +151,6 @@ def read(path: Path, request: Request) -> Log:
     return log_of('ulog', series, _facts(ulog) | _started(ulog), notes,
                   (*(one.name for one in series), *_declared(ulog)), inertial, speeds,
                   ulog.start_timestamp * 1e-6)
-
-
-def _topics(names: frozenset[str]) -> list[str]:
-    return list(dict.fromkeys((*TOPICS, *(re.split(r'[.\[]', name)[0] for name in names))))
 
 
 def _declared(ulog: Any) -> Iterator[str]:
