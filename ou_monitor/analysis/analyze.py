@@ -28,7 +28,6 @@ from ou_monitor.analysis.quality import noise_items, quality_list, QualityItem
 from ou_monitor.analysis.supply import (
     alarms, Dips, fed, flown_near, node_for, remainder, THROTTLES, without_wild)
 from ou_monitor.criticism.innovations import FAMILY_WISE
-from ou_monitor.criticism.readings import two_levels
 from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
@@ -114,9 +113,7 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
     if not recording.n:
         return ('The recording holds no samples.',)
     if not recording.has_throttle:
-        switches = two_levels(recording.voltage) if recording.current is None else ''
-        return ('The recording has no throttle: it is taken as one load level.',
-                *([switches] if switches else []))
+        return ('The recording has no throttle: it is taken as one load level.',)
     if any(math.isnan(level.throttle) for level in found):
         return ('No throttle was held long enough for a load level: the whole recording is taken '
                 'as one level, without its response to throttle. --levels can name levels.',)

@@ -166,8 +166,7 @@ def _sample_items(recording: Recording) -> list[QualityItem]:
     items, step, noise = [], find_step(v), innovation_std(v)
     if step > 0.0 and noise > 0.0:
         items.append(QualityItem('ADC_STEP', Severity.INFO, step_words(step, noise)))
-    throttle = np.nan_to_num(recording.throttle[:EXAMINED]) if recording.has_throttle else None
-    if np.isfinite(find_rails(v, step or usual_change(v), noise, throttle)).any():
+    if np.isfinite(find_rails(v, step or usual_change(v), noise)).any():
         items.append(QualityItem('CLIPPED', Severity.WARNING, (
             'Readings accumulate at one end of the range: the ADC may be saturated.')))
     return items

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from ou_monitor.timeline import new_readings
 
-# Maximum number of values used to find the step and clipping.
+# Maximum number of values used to find steps and repeats.
 EXAMINED = 200_000
 # Relative rounding error of the difference of two float32.
 _FLOAT32 = 2.5e-7
@@ -28,13 +28,9 @@ _AGAIN = 20
 # Clipping: minimum samples at the limit, visits to it, and excess over neighbouring codes in
 # standard errors.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
-# Maximum number of codes by which noise added after clipping raises a reading.
-_LIFTED = 2
 # Maximum step, in standard deviations of the noise, at which the counts of neighbouring codes
 # follow a smooth density.
 _COARSE = 2.0
-# Number of throttle ranges, each with its own noise; maximum throttle at idle, above the lowest.
-_LOADS, _STILL = 8, 0.01
 
 
 def find_step(voltage: FloatArray) -> float:
@@ -120,95 +116,45 @@ def step_words(step: float, noise: float) -> str:
             'between samples).')
 
 
-def find_rails(voltage: FloatArray, step: float, noise: float,
-               throttle: FloatArray | None = None) -> tuple[float, float]:
+def find_rails(voltage: FloatArray, step: float, noise: float) -> tuple[float, float]:
     """Return the readings at which the ADC clips, V; infinite if it does not (inputs in V)."""
     if step > _COARSE * noise:
         return -math.inf, math.inf
-    noisy = _at_noisy_throttle(voltage, step, throttle)
-    return -_clipping_limit(-voltage, step, noisy), _clipping_limit(voltage, step, noisy)
+    return -_clipping_limit(-voltage, step), _clipping_limit(voltage, step)
 
 
-def _at_noisy_throttle(voltage: FloatArray, step: float, throttle: FloatArray | None
-                       ) -> npt.NDArray[np.bool_]:
-    """Return the samples at throttles whose noise spans several codes."""
-    # A quiet rail at idle may stay within the top code without clipping.
-    if throttle is None or not step > 0.0:
-        return np.ones(voltage.size, dtype=bool)
-    edges = np.unique(np.quantile(throttle, np.arange(1, _LOADS) / _LOADS))
-    load = np.where(_idle(throttle), edges.size + 1, np.searchsorted(edges, throttle))
-    change, same = np.diff(voltage), load[1:] == load[:-1]
-    of = load[1:][same]
-    count = np.maximum(np.bincount(of, minlength=edges.size + 2), 1)
-    power = np.bincount(of, weights=change[same] ** 2, minlength=edges.size + 2) / count
-    return np.asarray(step <= _COARSE * np.sqrt(power))[load]
-
-
-def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
-    return np.asarray(throttle <= throttle.min() + _STILL)
-
-
-def _leans_up(below: FloatArray, codes: int, step: float) -> bool:
-    """Return whether the fullest of the top codes has more samples just above than just below."""
-    # Noise after clipping lowers as many readings as it raises.
-    count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
-    full = max(range(codes), key=lambda k: count[k])
-    return full > 0 and count[full - 1] > count[full + 1]
-
-
-def _clipping_limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
+def _clipping_limit(x: FloatArray, step: float) -> float:
     """Return the top reading if it is more frequent than its neighbours predict; otherwise inf."""
-    # If a stage before the ADC clips, later noise may raise some readings by a code or two.
     top = float(x.max())
     tie = _FLOAT32 * abs(top)
-    width = step if step > 0.0 else tie
     below = top - x
-    for codes in range(1, (_LIFTED if step > 0.0 else 0) + 2):
-        inside = below < (codes - 0.5) * width + tie
-        at = inside & noisy
-        count = int(at.sum())
-        if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS:
-            continue
-        others = below[~inside]
-        if not others.size or float(others.min()) > (codes - 1) * step + max(
-                3.5 * step, 0.2 * float(others.std())):
-            # A code far from all others is not clipping.
-            continue
-        if step > 0.0:
-            # In a falling tail no code is more frequent than the codes below.
-            next_ones = [float((np.abs(below[noisy] - (codes - 1 + k) * step)
-                                < 0.5 * step).sum()) for k in (1, 2, 3)]
-            expected = codes * max(next_ones)
-            if codes > 1 and (
-                    next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0])
-                    or _leans_up(below[noisy], codes, step)):
-                # A peak: the rail is at rest.
-                continue
-        else:
-            # Expect the same density as for the nearest samples below.
-            reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
-            expected = _LEAST * 2.0 * tie / max(reach, tie)
-        if count - expected > _CLEAR * math.sqrt(count + codes * expected):
-            full = max(range(codes), key=lambda k: int(
-                (np.abs(below[noisy] - k * width) < 0.5 * width + tie).sum()))
-            return float(x[np.abs(below - full * width) < 0.5 * width + tie].max())
-    return math.inf
+    at = below < 0.5 * step + tie
+    others = below[~at]
+    count = int(at.sum())
+    if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS or not others.size:
+        return math.inf
+    if float(others.min()) > max(3.5 * step, 0.2 * float(others.std())):
+        # A code far from all others is not clipping.
+        return math.inf
+    if step > 0.0:
+        # In a falling tail no code is more frequent than the codes below.
+        expected = max(float((np.abs(below - k * step) < 0.5 * step).sum()) for k in (1, 2, 3))
+    else:
+        # Expect the same density as for the nearest samples below.
+        reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
+        expected = _LEAST * 2.0 * tie / max(reach, tie)
+    return top if count - expected > _CLEAR * math.sqrt(count + expected) else math.inf
 
 
-# Minimum number of repeats, or of runs of repeats; probability of a tie below which the size of
-# the changes predicts the number of ties.
+# Minimum number of repeats; probability of a tie below which the size of the changes predicts the
+# number of ties.
 _FEWEST_TIES, _FINE = 20, 0.15
-# Lags at which equal values are counted (lag 8 still detects that seven of ten samples are held),
-# and longer lags, at which the period of a line is sought.
-_APART, _PERIODS = (2, 4, 8), range(9, 101)
+# Lags at which equal values are counted: lag 8 still detects that seven of ten samples are held.
+_APART = 2, 4, 8
 # Maximum ratio of a rail's noise to its noise at rest, and hence of the probabilities of a tie.
 _CALMEST = 100.0
-# Minimum excess of ties, and maximum deficit in size of changes that end runs, standard errors.
-_CLEARLY, _SHORT = 6.0, 3.0
-# Share of the readings at either end of the range; their runs may come from clipping.
-_END = 0.1
-# Maximum number of samples used to find repeats.
-_EXAMINED = 200_000
+# Minimum excess of ties, standard errors.
+_CLEARLY = 6.0
 
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
@@ -218,9 +164,10 @@ def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
     v, u = v[places], None if u is None else u[places]
     if period > 1.0:
         return t, v, u, period
-    first = max(0, (v.size - _EXAMINED) // 2)
-    held = v[1:] == v[:-1] if _has_excess_ties(v[first:first + _EXAMINED]) else _in_long_runs(v)
-    fresh = np.concatenate(([True], ~held))
+    first = max(0, (v.size - EXAMINED) // 2)
+    fresh = np.ones(v.size, dtype=np.bool_)
+    if _has_excess_ties(v[first:first + EXAMINED]):
+        fresh[1:] = v[1:] != v[:-1]
     return t[fresh], v[fresh], None if u is None else u[fresh], v.size / int(fresh.sum())
 
 
@@ -235,12 +182,10 @@ def _has_excess_ties(v: FloatArray) -> bool:
     moved = step[(step != 0.0) & inner]
     if moved.size < 2:
         return False
-    code = _code_step(v)
+    # At least the resolution of float32.
+    code = max(find_step(v), usual_change(v), 0.5 * _FLOAT32 * float(np.abs(v).max()))
     # Probability that two normal values have the same code.
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
-    if chance >= _FINE and float(np.mean(moved[1:] * moved[:-1] > 0.0)) > 0.5:
-        # A smooth voltage stays in each code for some samples.
-        return False
     share = _ties_without_holds(v, inner)
     if int(((step[1:] == 0.0) & (step[:-1] != 0.0)).sum()) < _FEWEST_TIES:
         # Ties are likelier at rest, but only up to a limit: more of them mean a stuck sensor.
@@ -248,13 +193,7 @@ def _has_excess_ties(v: FloatArray) -> bool:
     expected = count * max(chance if chance < _FINE else 0.0, share)
     smooth, error = _ties_of_codes(moved, code)
     return (equal - expected > _CLEARLY * math.sqrt(max(expected, 1.0))
-            and equal - smooth > _CLEARLY * math.hypot(math.sqrt(max(smooth, 1.0)), error)
-            and equal > count * _recurring_share(v, inner))
-
-
-def _code_step(v: FloatArray) -> float:
-    """Return the step between codes, at least the resolution of float32, V."""
-    return max(find_step(v), usual_change(v), 0.5 * _FLOAT32 * float(np.abs(v).max()))
+            and equal - smooth > _CLEARLY * math.hypot(math.sqrt(max(smooth, 1.0)), error))
 
 
 def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
@@ -266,47 +205,6 @@ def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
                 for k in (1.0, 2.0))
     expected = (one**4 / two) ** (1.0 / 3.0)
     return expected, expected * math.sqrt(8.0 / (9.0 * one) + 1.0 / (18.0 * two))
-
-
-def _in_long_runs(v: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which samples (from the second on) belong to runs of repeats too long for chance."""
-    # A quiet rail enters and leaves a run with a change of about one code.  With a lost link, the
-    # change before the run is of ordinary size, and the change after it is larger.
-    step = np.diff(v)
-    none = np.zeros(step.size, dtype=np.bool_)
-    equal = (step == 0.0) & (v[1:] > v.min()) & (v[1:] < v.max())
-    size = np.sort(np.abs(step[step != 0.0]))
-    code = _code_step(v)
-    edge = np.diff(equal.astype(np.int8), prepend=0, append=0)
-    begins, ends = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
-    if not size.size or not begins.size:
-        return none
-    chance = _ties_of_codes(size, code)[0] / step.size
-    if float(size[size.size // 2]) < 1.5 * code:
-        # If most changes are by one code, runs are longer than independent ties suggest.
-        chance = max(chance, float(np.mean(ends - begins > 1)))
-    chance = min(chance, 0.9)
-    least = max(2, math.ceil(math.log(step.size) / -math.log(chance)))
-    long = (ends - begins >= least) & (begins > 0) & (ends < step.size)
-    begins, ends = begins[long], ends[long]
-    if begins.size < _FEWEST_TIES:
-        return none
-    low, high = np.quantile(v, (_END, 1.0 - _END))
-    if float(np.mean((v[begins] > low) & (v[begins] < high))) < 0.5:
-        return none
-    usual = 0.5 - _SHORT / math.sqrt(12.0 * begins.size)
-    if 0.5 * float(np.mean(size < 1.25 * code)) > usual:
-        # Most changes are by one code, so they do not tell a quiet rail from a lost link.
-        return none
-    for ending in (np.abs(step[begins - 1]), np.abs(step[ends])):
-        rank = (np.searchsorted(size, ending - 0.25 * code)
-                + np.searchsorted(size, ending + 0.25 * code)) / (2.0 * size.size)
-        if float(rank.mean()) < usual:
-            return none
-    edge[:] = 0
-    edge[begins], edge[ends] = 1, -1
-    held: npt.NDArray[np.bool_] = np.cumsum(edge[:-1]) > 0
-    return held
 
 
 def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
@@ -321,9 +219,3 @@ def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
         nearer = math.sqrt(max(k, float(np.mean(apart**2)) / near)) if near > 0.0 else math.sqrt(k)
         shares.append(nearer * float(np.mean(apart[inner[k - 1:]] == 0.0)))
     return min(shares)
-
-
-def _recurring_share(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
-    """Return the largest share of values that recur after one period of a line."""
-    return max((float(np.mean(v[k:][inner[k - 1:]] == v[:-k][inner[k - 1:]]))
-                for k in _PERIODS if k < v.size // 2), default=0.0)

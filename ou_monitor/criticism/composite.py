@@ -114,7 +114,6 @@ def _kinds(terms: Sequence[Term | type[Term]]) -> list[str]:
 
 def _converged(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
                gaussian: GaussianFit) -> bool:
-    """Return whether the events and the offset of the laws have converged."""
     before = events or Events(np.zeros(1), np.zeros(1), np.ones(1), np.ones(1))
     if ((found.push > 0.0) != (before.push > 0.0)).any() or (
             (found.error > 0.0) != (before.error > 0.0)).any():

@@ -23,19 +23,13 @@ def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, Floa
 MARGIN = 0.5
 
 
-def seen_range(voltage: FloatArray) -> tuple[float, float]:
-    """Return the range allowed for a simulation: the recorded range, V, and a margin."""
+def stray(simulated: FloatArray, voltage: FloatArray) -> float:
+    """Return how far simulations leave a recorded range and its margin, V; inf if not finite."""
     low, high = float(np.min(voltage)), float(np.max(voltage))
     room = MARGIN * (high - low)
-    return low - room, high + room
-
-
-def stray(simulated: FloatArray, voltage: FloatArray) -> float:
-    """Return how far simulations, V, shape (..., n), leave `seen_range`, V; inf if not finite."""
-    low, high = seen_range(voltage)
     if not np.isfinite(simulated).all():
         return float('inf')
-    return max(0.0, low - float(np.min(simulated)), float(np.max(simulated)) - high)
+    return max(0.0, low - room - float(np.min(simulated)), float(np.max(simulated)) - high - room)
 
 
 def even_on_log(x: FloatArray, y: FloatArray, per_decade: int) -> tuple[FloatArray, FloatArray]:

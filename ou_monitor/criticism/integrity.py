@@ -8,23 +8,22 @@ scatter about an even grid, the scatter is real only if the voltage increments f
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import (
     find_rails, find_step, innovation_std, step_words, usual_change, without_repeats)
-from ou_monitor.criticism.readings import load_of, two_levels, usable, why_no_model
-from ou_monitor.criticism.samples import (
-    choose_samples, events_between, lines_between, Samples, without_tones)
+from ou_monitor.criticism.readings import load_of, usable, why_no_model
+from ou_monitor.criticism.samples import choose_samples, Samples
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantization, Saturation
 from ou_monitor.model.terms.shocks import outlying
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, percent
-from ou_monitor.timeline import new_readings, on_grid, repeats_words, scatter_words
+from ou_monitor.timeline import on_grid, repeats_words, scatter_words
 
 # Minimum samples of a fit.
 LEAST = 100
@@ -32,8 +31,6 @@ LEAST = 100
 NAMED_STEP = 0.3
 # Minimum range of throttle; if it moves less, it is not used.
 MOVES = 0.01
-# Maximum number of samples kept as logged, for the score of the plain model.
-_EXAMINED = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +41,6 @@ class Integrity:
     exact: tuple[Term, ...]  # Causes found without a model, with parameters
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     reason: str = ''  # Why there is nothing to fit; otherwise empty
-    # Samples as logged, repeats included, for the score of the plain model; None if they equal
-    # `samples`.
-    raw: Samples | None = None
     full: float = NAN  # Current at which the load is 1, A; NaN if the load is throttle
     # Clipped samples, which are replaced by random draws and so not scored; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
@@ -65,39 +59,23 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         return Integrity(None, (), tuple(notes), reason)
     report(0.2)
     exact: list[Term] = []
-    # A recording made in Python may still contain the steady repeats of a logger.
     whole = t
-    places, t, period = new_readings(t, v)
-    v, u = v[places], None if u is None else u[places]
-    logged = Samples(t[:_EXAMINED], v[:_EXAMINED], None)
     t, v, u, held = without_repeats(t, v, u)
     u, full = load_of(recording, t, v, u, notes)
-    notes += [two_levels(v)] if u is None and two_levels(v) else []
-    if period > 1.0 or recording.held or held > 1.0:
-        fresh = (v.size - 1) / float(t[-1] - t[0])
-        exact.append(HeldSamples(fresh))
-        if max(period, held) > 1.0:
-            notes.append(repeats_words(whole, t))
-    report(0.4)
     rate = (v.size - 1) / float(t[-1] - t[0])
+    if recording.held or held > 1.0:
+        exact.append(HeldSamples(rate))
+    if held > 1.0:
+        notes.append(repeats_words(whole, t))
+    report(0.4)
     which, note = choose_samples(v, rate)
     if note:
         notes.append(note)
-    lines = lines_between(t, v, which)
-    for line in lines:
-        notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and '
-                     'subtracted from the samples used, whose rate is too low to show it.')
-    between = events_between(v, u, rate, which)
-    origin = float(t[which.start])
-    events = (t[between], without_tones(t[between], v[between], origin, lines),
-              None if u is None else u[between])
     t, v, u = t[which], v[which], None if u is None else u[which]
-    v = without_tones(t, v, origin, lines)
-    exact += lines
     report(0.6)
     drawn = None
     step = find_step(v)
-    low, high = find_rails(v, step or usual_change(v), innovation_std(v[~outlying(v)]), u)
+    low, high = find_rails(v, step or usual_change(v), innovation_std(v[~outlying(v)]))
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
         # A limit that was not found is set far from all readings.
@@ -107,29 +85,15 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(f'{int(drawn.sum())} clipped samples were replaced by random draws beyond '
                      'the limit, from a model of the other samples.')
     cell = _judge_step(step, innovation_std(v), exact, notes)
-    stamps = judge_stamps(t, v)
-    notes += stamps.notes
-    if stamps.error > 0.0:
-        exact.append(ClockJitter(stamps.error))
+    t, error = judge_stamps(t, v, notes)
+    if error > 0.0:
+        exact.append(ClockJitter(error))
     recorded = recording.has_throttle or math.isfinite(full)
-    samples = Samples(stamps.t, v, _usable_throttle(u, recorded, notes),
+    samples = Samples(t, v, _usable_throttle(u, recorded, notes),
                       by_current=math.isfinite(full))
-    if between.size and drawn is None and stamps.error == 0.0:
-        samples = _joined(samples, *events)
-        notes.append(f'{between.size} samples around sudden changes were kept as well.')
     samples = samples.spread(samples.voltage, cell, np.random.default_rng(0))
     report(1.0)
-    raw = logged if held > 1.0 or any(
-        term.NAME in ('saturation', 'clock_jitter') for term in exact) else None
-    return Integrity(samples, tuple(exact), tuple(notes), raw=raw, full=full,
-                     drawn=drawn)
-
-
-def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
-    at = np.searchsorted(samples.t, t)
-    more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
-    return replace(samples, t=np.insert(samples.t, at, t),
-                   voltage=np.insert(samples.voltage, at, v), throttle=more)
+    return Integrity(samples, tuple(exact), tuple(notes), full=full, drawn=drawn)
 
 
 def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> float:
@@ -162,17 +126,10 @@ _WHITE = 0.3
 _TINY = 1e-6  # Scatter that counts as zero, in steps
 
 
-@dataclass(frozen=True, eq=False)
-class Stamps:
-    """Corrected stamps."""
-
-    t: FloatArray  # Stamps to use, s; shape (n,)
-    error: float  # Standard deviation of the errors of stamps, s; 0 if stamps are right
-    notes: tuple[str, ...]  # What was changed, one sentence each
-
-
-def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
-    """Replace stamps, s, by an even grid if their scatter is negligible or wrong."""
+def judge_stamps(t: FloatArray, voltage: FloatArray, notes: list[str]
+                 ) -> tuple[FloatArray, float]:
+    """Return stamps, s, or an even grid if their scatter is negligible or wrong; and its error."""
+    # error: standard deviation of wrong stamps, s; 0 if stamps are right.
     step = np.diff(t)
     usual = float(np.median(step))
     # First assume no gaps, because steps that scatter by half their length look like gaps.
@@ -182,27 +139,26 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         number = np.maximum(1.0, np.rint(step / usual))
         grid = on_grid(t, number)
     gaps = int((number > 1.0).sum())
-    notes = []
     if gaps:
         notes.append(f'{counted(gaps, "gap")} in the stamps, the longest '
                      f'{float(step.max()):.3g} s: kept as they are.')
     off = t - grid
     scatter = float(off.std()) / usual
     if scatter < _TINY:
-        return Stamps(t if gaps else grid, 0.0, tuple(notes))
-    white = abs(_correlation(off[1:], off[:-1])) < _WHITE
+        return t if gaps else grid, 0.0
+    white = abs(np.corrcoef(off[1:], off[:-1])[0, 1]) < _WHITE
     if scatter < _SMALL:
         notes.append(f'Stamps scatter by {percent(scatter)} of a step about an even grid, '
                      'which was used instead.')
-        return Stamps(grid, 0.0, tuple(notes))
+        return grid, 0.0
     if white and scatter < _LARGE and _are_wrong(step / usual, number, voltage):
         error = float(off.std())
         notes.append(f'Stamps scatter by {1e3 * error:.3g} ms about an even grid, but the voltage '
                      'does not follow: the stamps are wrong, and the grid was used.')
-        return Stamps(grid, error, tuple(notes))
+        return grid, error
     if uneven := scatter_words(t, _SMALL):
         notes.append(f'{uneven}: kept.')
-    return Stamps(t, 0.0, tuple(notes))
+    return t, 0.0
 
 
 def _are_wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
@@ -227,9 +183,3 @@ def _are_wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> boo
     ratio = 0.5 * ((follow - rail * weight) ** 2 - follow**2) / (
         weight * float(square @ square) / square.size)
     return bool(ratio > 0.5 * math.log(square.size))
-
-
-def _correlation(a: FloatArray, b: FloatArray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / norm if norm > 0.0 else 0.0

@@ -14,7 +14,7 @@ from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import timing
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, number
-from ou_monitor.timeline import in_order, supplied
+from ou_monitor.timeline import in_order, MOST_THROTTLE, plausible, supplied
 from scipy.special import chdtri
 
 # Minimum distance of an outlier from the median: in standard deviations, and relative to the next
@@ -24,8 +24,6 @@ _FAR, _GAP = 50.0, 5.0
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum number of single bad samples left out; in long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Minimum number of other samples if the share of an error code exceeds _MOST_CODES.
-_OTHERS = 100
 # Maximum number of values used for the spread.
 _EXAMINED = 200_000
 # A voltage counts as constant if at most this number, or this share, of samples differ.
@@ -34,9 +32,9 @@ _ODD, _ODD_SHARE = 3, 1e-3
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
-# Largest plausible throttle, with trim, and tolerance of the range 0..1; the readers of recordings
-# have already converted or refused other units.
-_MOST, _EDGE = 1.5, 0.05
+# Tolerance of the range 0..1 of throttle; the readers of recordings have converted or refused
+# other units.
+_EDGE = 0.05
 # Maximum gap in a current, s; quantile of its absolute value that counts as full load; lags of the
 # mean response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
@@ -44,9 +42,6 @@ _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
 _CHANCE = 0.02
 # Minimum autocorrelation from which a decay is computed.
 _CORRELATED = 0.1
-# Two levels of a voltage: minimum distance, in standard deviations about them and in ADC steps;
-# minimum switches, samples per switch, and share of the samples at each level.
-_APART, _STEPS, _SWITCHES, _DWELL, _SHARE = 5.0, 4.0, 3, 20, 0.05
 # Maximum second difference of a voltage that counts as a straight line, in rounding errors.
 _ROUNDINGS = 16.0
 
@@ -72,7 +67,12 @@ def usable(recording: Recording, notes: list[str]
                      'millivolts or counts of the ADC, every result in V is wrong by that factor; '
                      'give it in volts.')
     if u is not None:
-        u = _fill_gaps(t, _drop_implausible(u, notes), notes) if np.isfinite(u).any() else None
+        u = plausible(u, MOST_THROTTLE)
+        low, high = (float(np.nanmin(u)), float(np.nanmax(u))) if np.isfinite(u).any() else (0, 1)
+        if low < -_EDGE or high > 1.0 + _EDGE:
+            notes.append(f'Throttle lies within {number(low)} to {number(high)}, not 0 to 1: used '
+                         'as it is.')
+        u = _fill_gaps(t, u, notes)
     return t, v, u
 
 
@@ -126,7 +126,6 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
 
 
 def _part(v: FloatArray) -> slice:
-    """Return the samples that are examined."""
     return slice(None, None, -(-v.size // _EXAMINED))
 
 
@@ -188,11 +187,6 @@ def find_bad(v: FloatArray, singles: int = _SINGLES) -> npt.NDArray[np.bool_]:
     some = v[::max(1, v.size // _EXAMINED)]
     if some.size < 2:
         return bad
-    off = _off_value(some)
-    if off is not None:
-        bad[v == off] = True
-        bad[~bad] = find_bad(v[~bad], singles)
-        return bad
     low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)
     if low == high:
         low, high = _quantiles(some, 0.05, 0.95)
@@ -220,20 +214,6 @@ def find_bad(v: FloatArray, singles: int = _SINGLES) -> npt.NDArray[np.bool_]:
     return bad
 
 
-def _off_value(v: FloatArray) -> float | None:
-    """Return the frequent value, if any, that is far from all other samples."""
-    values, count = np.unique(v, return_counts=True)
-    value = float(values[count.argmax()])
-    others = v[v != value]
-    if int(count.max()) <= _MOST_CODES * v.size or others.size < _OTHERS:
-        return None
-    low, middle, high = _quantiles(others, 0.2, 0.5, 0.8)
-    away = np.abs(others - middle)
-    near = away[away <= _FAR * (high - low) / 1.683]
-    reach = max(_FAR * (high - low) / 1.683, _GAP * float(near.max()))
-    return value if high > low and abs(value - middle) > reach else None
-
-
 def _quantiles(v: FloatArray, *shares: float) -> list[float]:
     """Return quantiles without interpolation, which might overflow."""
     at = [round(share * (v.size - 1)) for share in shares]
@@ -243,7 +223,8 @@ def _quantiles(v: FloatArray, *shares: float) -> list[float]:
 
 def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
     """Return notes on bad samples (t in s, v in V)."""
-    rest = f'while all others lie within {_range(v[~bad])} V'
+    low, high = float(v[~bad].min()), float(v[~bad].max())
+    rest = f'while all others lie within {_short(low)} to {_short(high)} V'
     values, count = np.unique(v[bad], return_counts=True)
     notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as an error code, or '
              'as the supply being off, and left out.'
@@ -258,35 +239,8 @@ def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[
     return notes
 
 
-def _range(v: FloatArray) -> str:
-    return f'{_short(float(v.min()))} to {_short(float(v.max()))}'
-
-
 def _short(value: float) -> str:
     return f'{value:.6g}'
-
-
-def two_levels(v: FloatArray) -> str:
-    """Return the note for a voltage without a load that switches between two levels, or ''."""
-    ordered = np.sort(v[np.isfinite(v)])
-    sums, count = np.cumsum(ordered)[:-1], np.arange(1.0, ordered.size)
-    # Otsu's split of the values.
-    low, high = sums / count, (ordered.sum() - sums) / (ordered.size - count)
-    between = count * (ordered.size - count) * (high - low) ** 2
-    k = int(np.argmax(between)) if between.any() else 0
-    if not _SHARE < k / max(v.size, 1) < 1.0 - _SHARE:
-        return ''
-    apart, steps = float(high[k] - low[k]), np.diff(ordered)
-    within = math.sqrt(max(0.0, float(ordered.var() - between[k] / ordered.size ** 2)))
-    # Leave out transitions between the levels.
-    there = v[np.abs(v - 0.5 * (low[k] + high[k])) > 0.25 * apart] > ordered[k]
-    switches = int(np.count_nonzero(np.diff(there)))
-    least = max(_APART * within, _STEPS * float(steps[steps > 0.0].min()))
-    if not (least < apart and _SWITCHES <= switches < v.size / _DWELL):
-        return ''
-    return (f'The voltage switches between two levels, {number(float(low[k]), 4)} and '
-            f'{number(float(high[k]), 4)} V: a column of the load (--current-column or '
-            '--throttle-column) would explain it; without one, it counts as noise and lines.')
 
 
 def why_stuck(v: FloatArray) -> str:
@@ -317,41 +271,15 @@ def why_no_model(v: FloatArray) -> str:
     return ''
 
 
-def _drop_implausible(u: FloatArray, notes: list[str]) -> FloatArray:
-    """Return throttle with NaN where it is far outside 0..1; note all values outside."""
-    with np.errstate(invalid='ignore'):
-        wild = np.abs(u) > _MOST
-    if wild.any():
-        notes.append(f'Throttle is far outside its range at {counted(int(wild.sum()), "sample")}: '
-                     'taken as unknown there.')
-        u = np.where(wild, np.nan, u)
-    known = u[np.isfinite(u)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    if low < -_EDGE or high > 1.0 + _EDGE:
-        notes.append(f'Throttle lies within {number(low)} to {number(high)}, not 0 to 1: used '
-                     'as it is.')
-    return u
-
-
 def _fill_gaps(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
-    """Return throttle with the last value held over gaps; note their size."""
+    """Return throttle with the last value held over gaps, or the first one at the start."""
     there = np.isfinite(u)
-    known = np.flatnonzero(there)
-    if not known.size:
-        return None
-    if known.size == u.size:
-        return u
-    step = np.diff(t, append=t[-1])
-    total = float(step[~there].sum())
-    # Lengths of the gaps: unknown time between known samples.
-    lost = np.concatenate(([0.0], np.cumsum(np.where(there, 0.0, step))))
-    ends = lost[np.concatenate((known, [u.size]))]
-    longest = float(np.diff(ends, prepend=0.0).max())
+    if there.all() or not there.any():
+        return u if there.all() else None
+    unknown = float(np.diff(t, append=t[-1])[~there].sum())
     notes.append(
-        f'Throttle is unknown at {counted(u.size - known.size, "sample")} ({number(total)} of '
-        f'{number(float(t[-1] - t[0]))} s, the longest gap {number(longest)} s): the last '
-        'known value is held there' + ('' if there[0] else
-                                       ', and the first known one at the start')
-        + '. If throttle moved meanwhile, findings about throttle are wrong.')
-    at = np.searchsorted(known, np.arange(u.size), side='right') - 1
-    return u[known[np.maximum(at, 0)]]
+        f'Throttle is unknown at {counted(int((~there).sum()), "sample")} ({number(unknown)} of '
+        f'{number(float(t[-1] - t[0]))} s): the last known value is held there. If throttle moved '
+        'meanwhile, findings about throttle are wrong.')
+    first = int(np.argmax(there))
+    return u[np.maximum.accumulate(np.where(there, np.arange(u.size), first))]

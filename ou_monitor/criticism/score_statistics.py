@@ -2,13 +2,12 @@
 Test statistics of a model's scores: each is about standard normal if the model is right.
 
 Mean and spread of each come from a `NullBank`: simulations of the fitted baseline with the stamps
-and throttle of the data, fitted and evaluated in the same way.  Two kinds use theory instead:
-lines that follow throttle, because simulating them takes too long, and errors after large ones.
+and throttle of the data, fitted and evaluated in the same way.  Lines that follow throttle use
+theory instead, because simulating them takes too long.
 The name of a statistic begins with its kind, to which the `SIGNS` of terms refer.
 
-Three kinds of statistics belong to no term: loops of throttle, a growing effect of throttle, and
-errors after large ones.  They expose effects that imitate a term but have hysteresis, develop over
-minutes, or outlast their onset.
+Two kinds of statistics belong to no term, loops of throttle and a growing effect of throttle: they
+expose effects that imitate a term but have hysteresis or develop over minutes.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
@@ -32,8 +30,6 @@ from scipy.special import ndtri, stdtr, stdtrit
 _LAGS = ((1, 1), (2, 2), (3, 5), (6, 15), (16, 50))
 # Number of spectral bands.
 _BANDS = 8
-# Scores up to this size count as small.
-_SMALL = 2.5
 # Spans over which power is averaged, s.
 _CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
 # Lengths of segments for bursts, samples; maximum lag of products of three, samples.
@@ -42,12 +38,6 @@ _SEGMENTS, _TRIPLES = (32, 128, 512), 10
 _RELAYS = ((0.15, 0.85), (0.28, 0.72), (0.4, 0.6))
 # Minimum share of a regressor's power that the static response to throttle leaves unexplained.
 _LEAST = 0.02
-# Minimum size of a large error, standard deviations; minimum distance between two, samples.
-_LARGE, _APART = 4.0, 20
-# Minimum number of large errors for statistics of the errors after them.
-_FEW = 5
-# Edges of the groups of samples after a large error.
-_AFTER = (1, 4, 16, 64, 256, 1024)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +45,9 @@ class Covariates:
     """The series that the scores of a recording are correlated with."""
 
     state: FloatArray  # Deviation of the sample before, V; shape (n,)
-    at: FloatArray  # Time, s; shape (n,)
     throttle: FloatArray | None  # 0..1; shape (n,)
     rate: float  # Samples per second, Hz
     keep: float  # Share of the state that remains from one sample to the next
-    # Where large errors begin, as `large_signs` returns them; shape (n,).
-    large: FloatArray | None = None
     paths: tuple[tuple[str, FloatArray], ...] = ()  # As `throttle_paths` yields them; shape (n,)
 
 
@@ -82,7 +69,6 @@ def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, f
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
     yield from _correlations(w)
-    yield from _among_small(w)
     yield from _spectrum(w, given)
     if lines and given.throttle is not None:
         # The strongest line whose frequency follows throttle.
@@ -94,8 +80,6 @@ def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, f
     yield from _state(w, square, given)
     for name, path in given.paths:
         yield name, score(w, path)
-    if given.large is not None:
-        yield from after_large(w, square, given.large)
     yield from _beyond_second_order(w, given)
 
 
@@ -109,13 +93,6 @@ def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
         r = sum(float(c[k:] @ c[:-k]) for k in range(low, high + 1)) / power
         name = f'autocorrelation lag {low}' + ('' if low == high else f' to {high}')
         yield name, math.sqrt(n / (high - low + 1.0)) * r
-
-
-def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
-    """Yield the correlation of neighbours that are both small, which outliers do not affect."""
-    small = (np.abs(w[1:]) < _SMALL) & (np.abs(w[:-1]) < _SMALL)
-    if int(small.sum()) > 30:
-        yield 'small errors lag 1', score(w[1:][small], w[:-1][small])
 
 
 def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
@@ -216,8 +193,6 @@ def _state(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tup
     yield 'state cubed', score(w, x**3 - float((x**4).mean()) * x)
     yield 'variance state', score(square, x)
     yield 'variance state squared', score(square, x * x)
-    yield 'irreversibility', _mean_score(
-        w[1:] * (w[:-1] ** 2 - 1.0) - w[:-1] * (w[1:] ** 2 - 1.0))
     large = np.flatnonzero(np.abs(w[:-1]) > 3.0)
     pairs = w[large] * w[large + 1]
     yield 'pairs after a large one', float(pairs.sum()) / math.sqrt(
@@ -255,11 +230,6 @@ def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str
                                     ) * math.sqrt(9.0 * count / 2.0)
 
 
-def _mean_score(a: FloatArray) -> float:
-    spread = float(a.std())
-    return math.sqrt(a.size) * float(a.mean()) / spread if spread > 0.0 else 0.0
-
-
 def score(a: FloatArray, b: FloatArray) -> float:
     """Return the correlation of two series, as a normal score; 0 for a constant one."""
     a, b = a - a.mean(), b - b.mean()
@@ -293,50 +263,15 @@ def _residual(name: str, wanted: FloatArray, known: FloatArray, keep: float
         yield name, less - keep * np.concatenate((less[:1], less[:-1]))
 
 
-def large_signs(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-    """Return the signs of large errors; 0 elsewhere, and shortly after another large error."""
-    large = np.abs(errors) > _LARGE
-    if found is not None:
-        large |= found
-    where = np.flatnonzero(large)
-    first = np.concatenate((where[:1] >= 0, np.diff(where) > _APART))
-    out = np.zeros(errors.size)
-    out[where[first]] = np.sign(errors[where[first]])
-    return out
-
-
-def after_large(w: FloatArray, square: FloatArray, large: FloatArray
-                ) -> Iterator[tuple[str, float]]:
-    """Yield scores of the sign and of the size of errors that follow large ones."""
-    enough = int((large != 0.0).sum()) >= _FEW
-    signs, counts = np.cumsum(large), np.cumsum(np.abs(large))
-    for low, high in zip(_AFTER[:-1], _AFTER[1:]):
-        if high > large.size // 4:
-            return
-        yield (f'after large errors {low} to {high}',
-               score(w, _window(signs, low, high)) if enough else 0.0)
-        yield (f'power after large errors {low} to {high}',
-               score(square, _window(counts, low, high)) if enough else 0.0)
-
-
-def _window(total: FloatArray, low: int, high: int) -> FloatArray:
-    """Return the increase of a running total from `high` - 1 to `low` samples ago."""
-    def ago(k: int) -> FloatArray:
-        return np.concatenate((np.zeros(k), total[:-k]))
-    return ago(low) - ago(high)
-
-
 def covariates_of(samples: Samples, composite: Composite) -> Covariates:
     """Return the series that the scores of a model are correlated with."""
-    gaussian, events = composite.gaussian, composite.events
+    gaussian = composite.gaussian
     residual = samples.voltage - gaussian.mean
-    found = None if events is None else (events.push > 0.0) | (events.error > 0.0)
     keep = float(np.median(gaussian.phi[1:]))
     paths = () if samples.throttle is None else tuple(throttle_paths(samples.throttle, keep))
     return Covariates(
-        state=np.concatenate(([0.0], residual[:-1])), at=samples.t - samples.t[0],
-        throttle=samples.throttle, rate=1.0 / float(np.median(samples.step[1:])), keep=keep,
-        large=large_signs(gaussian.z, found), paths=paths)
+        state=np.concatenate(([0.0], residual[:-1])), throttle=samples.throttle,
+        rate=1.0 / float(np.median(samples.step[1:])), keep=keep, paths=paths)
 
 
 # Number of simulated recordings.
@@ -368,36 +303,24 @@ def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[st
     return bank.standardised(statistics(composite.z, covariates_of(samples, composite)))
 
 
-def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size: int = SIZE
-                  ) -> NullBank:
-    """Simulate the null distributions of the statistics for a plain OU."""
-    rows = []
-    n = given.at.size
-    for _ in range(size):
-        y = lfilter([1.0], [1.0, -phi], rng.standard_normal(n))
-        z, state = refit(y)
-        rows.append(statistics(z, replace(given, state=state, large=None), lines=False))
-    return _summary(rows)
-
-
-def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
-                     size: int = SIZE) -> NullBank:
-    """Simulate the null distributions for a model with more terms than the `ou`."""
-    # Needed if the ADC's step is as large as the noise: then even the errors of the right model
-    # are neither normal nor independent.
-    model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
-    for _ in range(size):
-        y = model.simulate(samples.t, rng, samples.throttle)
-        drawn = samples.spread(y, samples.cell, rng)
-        fit = evaluate(drawn, composite.terms)
-        state = np.concatenate(([0.0], (drawn.voltage - fit.mean)[:-1]))
-        rows.append(statistics(fit.z, replace(given, state=state, large=None), lines=False))
-    return _summary(rows)
-
-
-def _summary(rows: list[dict[str, float]]) -> NullBank:
-    """Return means, shrunk towards 0, and standard deviations, shrunk towards 1."""
-    weight = len(rows) / (len(rows) + _PRIOR)
+def simulate_bank(samples: Samples, composite: Composite, rng: np.random.Generator) -> NullBank:
+    """Simulate the null distributions of the statistics for a model."""
+    # A plain OU is fitted again to each simulation.  A model with further terms is needed if the
+    # step of the ADC is as large as the noise: then even the errors of the right model are neither
+    # normal nor independent.
+    model, rows = SupplyModel(composite.terms), []
+    given = covariates_of(samples, composite)
+    for _ in range(SIZE):
+        if len(composite.terms) == 1:
+            z, state = refit(lfilter([1.0], [1.0, -given.keep], rng.standard_normal(samples.n)))
+        else:
+            y = model.simulate(samples.t, rng, samples.throttle)
+            drawn = samples.spread(y, samples.cell, rng)
+            fit = evaluate(drawn, composite.terms)
+            z, state = fit.z, np.concatenate(([0.0], (drawn.voltage - fit.mean)[:-1]))
+        rows.append(statistics(z, replace(given, state=state), lines=False))
+    # Means are shrunk towards 0, and standard deviations towards 1.
+    weight = SIZE / (SIZE + _PRIOR)
     mean, std = {}, {}
     for name in rows[0]:
         v = np.array([row[name] for row in rows if name in row])

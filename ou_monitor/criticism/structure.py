@@ -460,15 +460,9 @@ def _means(terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def mean_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the mean of the voltage, V, cached by terms and coefficients."""
+    """Return the mean of the voltage, V."""
     beta = np.array([value for term in terms for value in coefficients(term)])
-    if any(isinstance(term, ACCoupling) for term in terms):
-        return np.asarray(columns_of(samples, terms, s) @ beta)
-    key = (*beta.tolist(), *_means(terms))
-    if key not in samples.means:
-        samples.means.clear()
-        samples.means[key] = columns_of(samples, terms, s) @ beta
-    return samples.means[key]
+    return np.asarray(columns_of(samples, terms, s) @ beta)
 
 
 def owners(terms: Sequence[Term]) -> list[Term | None]:

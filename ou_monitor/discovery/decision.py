@@ -14,7 +14,6 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.score_statistics import is_sign
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.term import Role, Term
 
 Statistics = Mapping[str, float]
@@ -133,17 +132,6 @@ def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
     """Return the causes of a round that tie with the best (evidence in nats)."""
     top = next(value for name, value in evidence if name == best)
     return [name for name, value in evidence if name != best and value > top - TIE]
-
-
-def is_plainer(one: Kind, other: Kind) -> bool:
-    """Return whether a cause wins a tie, because fewer alternatives were searched for it."""
-    return one.SEARCH < other.SEARCH and one.FAMILY == other.FAMILY
-
-
-def only_to_changes(responses: Iterable[Kind]) -> bool:
-    """Return whether a mean responds to throttle by transients alone, as behind an AC coupling."""
-    names = {kind.NAME for kind in responses}
-    return LoadTransient.NAME in names and LoadSag.NAME not in names
 
 
 def relaxes(rate: float, duration: float) -> bool:

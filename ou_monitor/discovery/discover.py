@@ -14,22 +14,21 @@ from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.score_statistics import criticise, family_chance, family_edge
-from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, LoadFall, LowDips, Verdict
 from ou_monitor.discovery.fitting import (
     COLLINEAR, Fitter, follows_time, standard_errors, with_reach)
 from ou_monitor.discovery.gain import (
-    covered, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of, why_unknown,
+    covered, gain_of, growth_of, guess, held_out, HeldOut, mean_score, shrink_of, why_unknown,
     without)
 from ou_monitor.discovery.load_effects import load_fall, low_dips
-from ou_monitor.discovery.named import Named, named_causes
-from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
+from ou_monitor.discovery.named import (
+    Named, named_causes, prune_by_gain, Pruned, refusal)
 from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
-    by_load, collinear_note, coupling_found, coupling_note, explain, left_out_note, NO_OTHER,
+    by_load, collinear_note, coupling_note, explain, left_out_note, NO_OTHER,
     no_relaxation_note, VAGUE, verdict_words)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
@@ -40,8 +39,6 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
 from ou_monitor.text import listed, number, Z95
 
-# Why the gain of a line above the Nyquist frequency of the samples used is unknown.
-FAST = 'the rate of the samples used is too low to show this line.'
 # Alternations between drawing clipped or coarse samples and fitting the load to them.
 _REDRAWN = 3
 # Number of these alternations that also choose the terms of the load: first from the codes, then
@@ -82,7 +79,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
                              lambda share: done(0.1 + 0.5 * share))
         model, names = (named.whole, named.names) if inside is samples else _fit_to_codes(
             samples, state, named)
-        plain = _plain_model(samples, state)
+        plain = _plain_model(samples)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
             raise
@@ -107,15 +104,15 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     done(0.95)
     load = 'current' if math.isfinite(state.full) else 'throttle'
     causes = tuple(replace(cause, explanation=by_load(cause.explanation, load)) for cause in
-                   _causes(samples, state, left, se, plain, scored, named.rivals))
+                   _causes(samples, state, left, se, scored, named.rivals))
     gain, gain_se = gain_of(left.full, plain, scored)
     unknown = why_unknown(left.full, plain, scored, bool(uncovered))
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
     criticism = _criticism(named.before, after)
     remaining = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
-    larger = errors_grew(left.full, plain, scored, 1.0)
-    refused = refusal(samples, whole.terms, gain, gain_se, larger and errors_grew(
-        left.full, plain, scored, Z95)) if causes else ''
+    growth = growth_of(left.full, plain, scored)
+    larger = growth > 1.0
+    refused = refusal(samples, whole.terms, gain, gain_se, growth > Z95) if causes else ''
     # The effects of other exact terms were removed from the samples; the model includes them.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     baseline = plain.model.terms[0]
@@ -216,30 +213,18 @@ def _refitted(samples: Samples, terms: Sequence[Term]) -> Composite | None:
     return fit_composite(samples, terms, slice(0, samples.n))
 
 
-def _plain_model(samples: Samples, state: Integrity) -> HeldOut:
-    """Return the plain OU, fitted to the samples as logged, repeats and wrong stamps included."""
-    everything = slice(0, samples.n)
-    plain = fit_composite(samples, [guess(samples)], everything)
+def _plain_model(samples: Samples) -> HeldOut:
+    plain = _refitted(samples, [guess(samples)])
     assert plain is not None
-    found = held_out(samples, plain)
-    if state.raw is None or not np.ptp(state.raw.voltage) > 0.0:
-        return found
-    logged = fit_gaussian(state.raw, [guess(state.raw)], slice(0, state.raw.n)).terms
-    gaussian = evaluate(samples, logged)
-    # The loss from holding out a block is taken from the fit to the samples without repeats.
-    density = gaussian.density + found.density - plain.density
-    return HeldOut(replace(plain, terms=logged, gaussian=gaussian, density=density), density,
-                   found.known & np.isfinite(density), gaussian.innovation)
+    return held_out(samples, plain)
 
 
 def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str, Any], ...],
-            plain: HeldOut, scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]
-            ) -> tuple[Cause, ...]:
+            scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]) -> tuple[Cause, ...]:
     """Return all causes: exact findings first, then the causes that the search named."""
     # The gain of a cause is what the model loses when refitted without it.  If there are many
     # causes of one kind (harmonics of a line), they are left out together and share one gain.
-    # Repeats, clipping and wrong stamps, which are corrected in the samples, share one gain, too:
-    # what the plain OU loses if it is fitted to the samples as logged.
+    # Repeats, clipping and wrong stamps are corrected in the samples of both models: no gain.
     found: list[Cause] = []
     model = left.full.model
     for term in state.exact:
@@ -251,16 +236,11 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
             gain, error = (math.nan, math.nan) if less is None else gain_of(
                 left.full, held_out(samples, less), scored)
             why = '' if math.isfinite(gain) else NO_OTHER if less is None else VAGUE
-        elif term.FAMILY == 'line':
-            gain, error, why = math.nan, math.nan, FAST
         else:
-            clean = fit_composite(samples, [guess(samples)], slice(0, samples.n))
-            assert clean is not None
-            gain, error = gain_of(held_out(samples, clean), plain, scored)
-            why = '' if math.isfinite(gain) else VAGUE
+            gain, error = 0.0, 0.0
         shown = with_reach(term, {}, samples)
         found.append(Cause(term, shown, gain, error, 0.0, (),
-                           explain(term, shown, gain, error, (), True, why), True))
+                           explain(term, shown, (), True, why), True))
     for k, name in enumerate(left.names):
         worth, index = left.worth[k], position(model, left.names, k)
         why = '' if math.isfinite(worth.gain) else NO_OTHER if worth.less is None else (
@@ -269,8 +249,7 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
         term = model.terms[index]
         found.append(Cause(
             term, se[index], worth.gain, worth.error, worth.chance, others,
-            explain(term, se[index], worth.gain, worth.error, others, False, why, worth.size,
-                    worth.chance), False))
+            explain(term, se[index], others, False, why, worth.size), False))
     return tuple(found)
 
 
@@ -301,11 +280,10 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     ou = model.terms[0]
     assert isinstance(ou, OU)
     step = float(np.median(samples.step[1:]))
-    if model.has('ac_coupling'):
-        notes.append(coupling_found(duration))
-    elif ou.alpha * step > _BLIND:
+    if ou.alpha * step > _BLIND:
         notes.append(no_relaxation_note(ou.alpha, step))
-    elif relaxes(ou.alpha, duration) and not model.has('load_sag') and not model.has('drift'):
+    elif relaxes(ou.alpha, duration) and not any(
+            model.has(name) for name in ('ac_coupling', 'load_sag', 'drift')):
         # A lasting sag or drift would rule out an AC coupling.
         notes.append(coupling_note(ou.alpha, duration))
     return tuple(notes)

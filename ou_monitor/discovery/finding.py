@@ -71,11 +71,6 @@ class Cause:
         """Return the name of the cause."""
         return self.term.NAME
 
-    @property
-    def measurable(self) -> bool:
-        """Whether the gain is distinguishable from zero."""
-        return self.gain > Z95 * self.gain_se
-
 
 @dataclass(frozen=True)
 class LowDips:
@@ -99,15 +94,6 @@ class LowDips:
         off = abs(self.extended - self.observed)
         return (off > Z95 * math.hypot(self.extended_se, self.observed_se)
                 and off > abs(self.baseline - self.observed))
-
-    def as_data(self) -> dict[str, Any]:
-        """Return the count for JSON."""
-        return {'level_v': self.level, 'count': self.count, 'made_by_load': self.made}
-
-    def rates(self) -> dict[str, float]:
-        """Return dips per minute for JSON."""
-        return {name: getattr(self, name) for name in (
-            'observed', 'baseline', 'extended', 'observed_se', 'baseline_se', 'extended_se')}
 
 
 # Relative error above which the model does not reproduce a fall under load.
@@ -231,9 +217,12 @@ class Finding:
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
                 'gain_se': self.gain_se, 'errors_shrink': self.shrink,
                 'size_gain': self.size_gain, 'closer': self.closer,
-                'crossing_rate': self.dips.rates()},
+                'crossing_rate': {name: getattr(self.dips, name) for name in (
+                    'observed', 'baseline', 'extended', 'observed_se', 'baseline_se',
+                    'extended_se')}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'dips': self.dips.as_data(),
+            'dips': {'level_v': self.dips.level, 'count': self.dips.count,
+                     'made_by_load': self.dips.made},
             'fall': {'from': self.fall.low, 'to': self.fall.high,
                      'measured_v': self.fall.measured, 'explained_v': self.fall.explained},
             'refused': self.unsaved or self.refused or None, 'notes': list(self.notes)})

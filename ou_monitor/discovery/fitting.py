@@ -291,7 +291,6 @@ def is_trend(samples: Samples, model: Composite) -> bool:
 
 
 def _added_term(composite: Composite) -> Term:
-    """Return the term that was added last."""
     return [term for term in composite.terms if term.ROLE is not Role.LAW][-1]
 
 
@@ -448,27 +447,19 @@ def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, d
     return found
 
 
-def _with_coefficients(term: Term, beta: list[float]) -> Term:
-    return replace(term, u0=beta[0]) if isinstance(term, OU) else term.with_linear(beta)
-
-
 def _by_parameter(term: Term, covariance: FloatArray) -> dict[str, Any]:
     """Return errors of parameters from the covariance of the coefficients."""
-    beta = coefficients(term)
-    names = ('u0',) if isinstance(term, OU) else term.LINEAR
-    spread = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    slopes = np.zeros((len(names), len(beta)))
-    for j, error in enumerate(spread.tolist()):
-        step = 1e-3 * error
-        if step <= 0.0:
-            continue
-        up, down = list(beta), list(beta)
-        up[j], down[j] = beta[j] + step, beta[j] - step
-        high, low = _with_coefficients(term, up), _with_coefficients(term, down)
-        for i, name in enumerate(names):
-            a, b = getattr(high, name), getattr(low, name)
-            if not isinstance(a, tuple):
-                slopes[i, j] = (a - b) / (2.0 * step)
-    variance = np.einsum('ij,jk,ik->i', slopes, covariance, slopes)
-    return {name: math.sqrt(max(float(value), 0.0)) for name, value in zip(names, variance)
-            if value > 0.0}
+    if isinstance(term, OU):
+        return {'u0': math.sqrt(max(float(covariance[0, 0]), 0.0))}
+    names = [name for name in term.LINEAR if not isinstance(getattr(term, name), tuple)]
+
+    def values(beta: FloatArray) -> FloatArray:
+        moved = term.with_linear(beta.tolist())
+        return np.array([getattr(moved, name) for name in names])
+
+    beta = np.array(coefficients(term))
+    steps = 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    slopes = np.stack([(values(beta + by) - values(beta - by)) / max(2.0 * float(by.max()), 1e-300)
+                       for by in np.diag(steps)], axis=1)
+    variance = np.einsum('ij,jk,ik->i', slopes, covariance, slopes).tolist()
+    return {name: math.sqrt(value) for name, value in zip(names, variance) if value > 0.0}

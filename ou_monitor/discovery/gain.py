@@ -28,7 +28,6 @@ from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.text import Z95
 from scipy.special import ndtr
 from scipy.stats import chi2
 
@@ -127,10 +126,16 @@ def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> floa
     return 1.0 - math.sqrt(float(np.mean(new.error[both] ** 2) / np.mean(old.error[both] ** 2)))
 
 
-def errors_grew(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_], errors: float) -> bool:
-    """Return whether one-step errors grew by more than `errors` standard errors."""
+def growth_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> float:
+    """Return by how many standard errors the squares of one-step errors grew."""
+    # If the new model is right, its errors are independent of the differences from the old ones;
+    # their variances, V^2, then give the standard error of the increase.  Errors may grow although
+    # the likelihood rises: a model may treat a few bursts as noise and gain elsewhere.
     both = scored & new.known & old.known
-    return errors_grow(new.error[both], old.error[both], new.model.gaussian.variance[both], errors)
+    now, before = new.error[both], old.error[both]
+    variance = new.model.gaussian.variance[both]
+    error = 2.0 * math.sqrt(float(np.sum(variance * (before - now)**2)))
+    return float(np.sum(now**2 - before**2)) / max(error, 1e-300)
 
 
 def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
@@ -244,17 +249,6 @@ def _refitted(data: Samples, terms: Sequence[Term], events: Events | None,
         if turn == _HALVINGS or float((there.density - density)[others].sum()) > -_ROUGH:
             return there
     return None
-
-
-def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: float = Z95
-                ) -> bool:
-    """Return whether one-step errors (rms) grew by more than `errors` standard errors."""
-    # If the new model is right, its errors are independent of the differences from the old ones;
-    # their variances, V^2, then give the standard error of the increase.  Errors may grow although
-    # the likelihood rises: a model may treat a few bursts as noise and gain elsewhere.
-    difference = old - new
-    error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
-    return float(np.sum(new**2 - old**2)) > errors * error
 
 
 def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: FloatArray

@@ -1,36 +1,35 @@
 """
-Named causes: the causes that a search accepted and that a second criticism does not refute.
+Named causes: accepted by a search, not refuted by a second criticism, and of use to predictions.
 
 The model is criticised on the whole recording; causes that do not explain their statistics are
-withdrawn, and the search continues without them.
+withdrawn, and the search continues without them.  Then a cause is removed if the rest, refitted,
+predicts held-out blocks equally well; the others are tested again, because one of them may now
+account for its effect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.score_statistics import (
-    covariates_of, criticise, NullBank, simulate_bank, simulate_bank_of)
-from ou_monitor.criticism.structure import evaluate
+from ou_monitor.criticism.score_statistics import criticise, NullBank, simulate_bank
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.fitting import Fitter, standard_errors
+from ou_monitor.discovery.fitting import Fitter, is_trend, standard_errors
+from ou_monitor.discovery.gain import cause_gain, held_out, HeldOut, without
 from ou_monitor.discovery.search import (
-    kinds_of, name_causes, position, Progress, Search, under_load, without_causes)
-from ou_monitor.model.terms.catalogue import blamed
-from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.slow import Drift, SecondRelaxation
+    kinds_of, name_causes, outside_range, position, Progress, Search, under_load, without_causes)
+from ou_monitor.discovery.words import is_vague
+from ou_monitor.model.terms.catalogue import blamed, catalogue
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.model.terms.tones import prominence, Resonance, Tone
+from ou_monitor.records import NAN
 
 # Maximum number of searches, each without the causes withdrawn before.
 _TURNS = 3
-# Amplitude, in standard errors, from which a line is never withdrawn.
-_SURE = 25.0
 
 # Note if the search was cut short.
 STOPPED = ('The search for causes was cut short because the next ones would have taken too long; '
@@ -55,17 +54,12 @@ class Named:
 def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                  exact: tuple[Term, ...], progress: Progress) -> Named:
     """Search for causes; withdraw those that do not explain their statistics."""
-    phi = float(np.median(start.gaussian.phi[1:]))
-    if len(start.terms) > 1:
-        bank = simulate_bank_of(samples, start, rng)
-    else:
-        bank = simulate_bank(covariates_of(samples, start), phi, rng)
+    bank = simulate_bank(samples, start, rng)
     before = criticise(samples, start, bank)
     fitter = Fitter(samples, start.cost)
     search = Search(fitter.fit(start.terms, start) or start)
     found = _Result(search.copy(), start, before)
-    # Only lines above the Nyquist frequency were subtracted, so `line` causes stay allowed.
-    given = [term.NAME for term in exact if term.FAMILY != 'line']
+    given = [term.NAME for term in exact]
     failure, begun = '', None
     dropped: list[str] = []
     refuted = -math.inf
@@ -102,8 +96,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         # Once the load model has been chosen, any state of the search can be used.
         found = _fit_everything(fitter, search, bank)
     names = found.search.accepted
-    return Named(found.whole, bank, tuple(names),
-                 _with_trends(samples, found.whole, found.search.rivals),
+    return Named(found.whole, bank, tuple(names), found.search.rivals,
                  tuple(name for name in dict.fromkeys(dropped) if name not in names), before,
                  found.after, failure or (STOPPED if search.stopped else ''))
 
@@ -131,42 +124,159 @@ def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
     # Noise terms of the load model stay.
     out = [k for k in out if names[k] not in begun.search.accepted]
     view = fitter.view(found.whole)
-    return sorted({*_in_doubt(fitter.samples, found.whole, names, out),
+    return sorted({*out,
                    # Causes with states of their own that no longer fit their name.
                    *(k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
                      and not found.whole.terms[position(found.whole, names, k)].holds(view))})
 
 
-def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
-                 ) -> dict[str, list[str]]:
-    """Return the rivals of each cause; a relaxation that is a trend has a drift as a rival."""
-    duration = float(samples.t[-1] - samples.t[0])
-    # The `ou` may be the slower of the two.
-    slow = whole.has(SecondRelaxation.NAME) and not whole.has(Drift.NAME) and any(
-        isinstance(term, (OU, SecondRelaxation)) and not decision.relaxes(term.alpha, duration)
-        for term in whole.terms)
-    return {name: [*others, Drift.NAME] if slow and name == SecondRelaxation.NAME
-            and Drift.NAME not in others else others for name, others in rivals.items()}
+# Minimum number of causes of one kind whose gain is measured together.
+MANY = 4
+# Maximum number of rounds.
+_ROUNDS = 4
 
 
-def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Sequence[int]
-              ) -> list[int]:
-    """Return the causes to withdraw; strong lines always stay."""
-    errors: Sequence[Mapping[str, float]] = ()
-    if any(names[k] == Tone.NAME for k in out):
-        errors = standard_errors(samples, whole, slice(0, samples.n))
+@dataclass(frozen=True)
+class Worth:
+    """What the model loses without a group of terms."""
 
-    def is_sure(k: int) -> bool:
-        if names[k] not in (Tone.NAME, Resonance.NAME):
-            return False
-        at = position(whole, names, k)
-        term = whole.terms[at]
-        if isinstance(term, Tone):
-            return term.amplitude > _SURE * errors[at].get('amplitude', math.inf)
-        assert isinstance(term, Resonance)
-        z = evaluate(samples, [other for other in whole.terms
-                               if other is not term and other.ROLE is not Role.LAW]).z
-        rate = 1.0 / float(np.median(samples.step[1:]))
-        return prominence(z, rate, term.frequency, term.damping / math.pi) > decision.FAILS
+    # Gain and standard error, nats per sample.
+    gain: float = NAN
+    error: float = NAN
+    chance: float = NAN  # p-value; see `gain.cause_gain`
+    size: int = 1  # Terms of the group
+    less: HeldOut | None = None  # The model without the group
 
-    return [k for k in out if not is_sure(k)]
+
+@dataclass(eq=False)
+class Pruned:
+    """The remaining model, and the gain of each of its causes."""
+
+    full: HeldOut
+    names: list[str]  # Its causes, in the order of acceptance
+    worth: list[Worth] = field(default_factory=list)
+    out: list[str] = field(default_factory=list)  # Removed causes
+
+
+def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
+                  scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Pruned:
+    """Remove the causes that do not improve held-out predictions, the worst first."""
+    state = Pruned(held_out(samples, model), list(names))
+    for turn in range(_ROUNDS):
+        _measure(samples, state, plain, scored, lambda share: progress(
+            1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
+        vague = _undetermined(samples, state)
+        failing = [k for k, worth in enumerate(state.worth) if worth.less is not None and (
+            k in vague or not decision.improves_predictions(worth.gain, worth.error, worth.chance)
+            and not _absorbs_trend(samples, state, k))]
+        worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
+                 if failing else _cause_of_straying(samples, state))
+        if worst is None or turn == _ROUNDS - 1:
+            break
+        _leave_out(state, worst)
+    return state
+
+
+def _undetermined(samples: Samples, state: Pruned) -> list[int]:
+    """Return causes whose amplitudes are all undetermined, unless another cause needs them."""
+    model, found = state.full.model, []
+    errors = standard_errors(samples, model, slice(0, samples.n))
+    for k, worth in enumerate(state.worth):
+        at = position(model, state.names, k)
+        term = model.terms[at]
+        vague = [is_vague(value, errors[at].get(name)) for name, value in term.values().items()
+                 if term.positive(name) and term.unit(name) in ('V', 'V/sqrt(s)')]
+        if worth.size == 1 and vague and all(vague) and not any(
+                other.CHANGES is type(term) for other in model.terms):
+            found.append(k)
+    return found
+
+
+def _leave_out(state: Pruned, worst: int) -> None:
+    """Remove a cause and the terms that depend on it."""
+    less = state.worth[worst].less
+    assert less is not None
+    kept = {term.NAME for term in less.model.terms}
+    gone = state.names[worst]
+    many = state.worth[worst].size > 1
+    left = [name for k, name in enumerate(state.names)
+            if k != worst and not (many and name == gone)
+            and (name in kept or name == gone)]
+    state.out += [name for name in set(state.names) if state.names.count(name)
+                  > left.count(name)]
+    state.names, state.full = left, less
+
+
+def _cause_of_straying(samples: Samples, state: Pruned) -> int | None:
+    """Return the cause, if any, whose removal keeps simulations within the recorded range."""
+    # A term may improve one-step predictions although its simulations exceed the recorded range.
+    # Responses of the mean are not tested.
+    def far_of(model: Composite) -> float:
+        try:
+            return outside_range(samples, model.terms)
+        except ValueError:
+            return math.inf
+
+    far = far_of(state.full.model)
+    if not far > 0.0:
+        return None
+    other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
+             if worth.less is not None and not decision.is_response(catalogue()[state.names[k]])}
+    # The single cause with the least gain; combinations are not tried.
+    return min((k for k, stays in other.items() if not stays > 0.0), default=None,
+               key=lambda k: state.worth[k].gain)
+
+
+def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:
+    """Return whether `ou` would become a trend without this response of the mean."""
+    less = state.worth[k].less
+    return (decision.is_response(catalogue()[state.names[k]]) and less is not None
+            and is_trend(samples, less.model) and not is_trend(samples, state.full.model))
+
+
+def _measure(samples: Samples, state: Pruned, plain: HeldOut, scored: npt.NDArray[np.bool_],
+             progress: Callable[[float], None]) -> None:
+    """Measure the gain of each cause, or of all causes of one kind if there are many."""
+    # If the rest predicts worse than the plain OU, the gain is relative to the plain OU.
+    state.worth = []
+    found: dict[tuple[int, ...], Worth] = {}
+    for k in range(len(state.names)):
+        group = group_of(state.full.model, state.names, k)
+        if group not in found:
+            less = without(samples, state.full.model, *group, plain=plain.model)
+            if less is None:
+                found[group] = Worth(size=len(group))
+            else:
+                other = held_out(samples, less)
+                both = scored & other.known & plain.known
+                if both.any() and other.density[both].mean() < plain.density[both].mean():
+                    other = plain
+                found[group] = Worth(*cause_gain(state.full, other, scored), len(group), other)
+        state.worth.append(found[group])
+        progress((k + 1) / len(state.names))
+
+
+def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
+    """Return the index of the k-th cause in a model, or of all of its kind if there are many."""
+    if list(names).count(names[k]) < MANY:
+        return (position(model, names, k),)
+    return tuple(position(model, names, j) for j, name in enumerate(names) if name == names[k])
+
+
+def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
+            larger: bool = False) -> str:
+    """Return why a model is refused, in words; otherwise empty (gains in nats per sample)."""
+    # larger: whether its one-step errors are significantly larger than those of the plain OU.
+    if math.isfinite(gain) and not decision.improves_predictions(gain, gain_se, 0.0):
+        return 'The extended model predicts worse than the plain OU'
+    if larger:
+        return 'One-step errors of the extended model are larger than those of the plain OU'
+    try:
+        far = outside_range(samples, terms)
+    except ValueError as error:
+        return f'The extended model cannot be simulated ({error})'
+    if far > 0.0:
+        by = 'without bound' if math.isinf(far) else f'by {far:.2g} V'
+        return ('Simulations of the extended model exceed the recorded range and its margin (half '
+                f'of the range at either end) {by}')
+    return ''

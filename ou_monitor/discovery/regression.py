@@ -70,10 +70,9 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
 
 @dataclass(frozen=True)
 class MeanResponse:
-    """Terms of the mean, and the evidence of each."""
+    """Terms of the mean, and their rivals."""
 
     terms: tuple[Term, ...]  # In the order of their evidence, the largest first
-    worth: tuple[float, ...]  # Evidence lost without each, nats
     rivals: tuple[tuple[str, ...], ...]  # For each, other causes that fit about as well
 
 
@@ -88,7 +87,7 @@ def mean_response(samples: Samples, composite: Composite, view: View,
     pool += [term for term in (*forms, *_candidates(view)) if not _contains(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
-        return MeanResponse((), (), ())
+        return MeanResponse((), ())
     found = _Regression(samples, composite, pool).search([
         k for k, term in enumerate(pool) if term in own or term in start])
     return _refined(samples, composite, found)
@@ -98,7 +97,7 @@ def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> Mea
     """Return a response whose time constants and delays, chosen from a list, are refined."""
     # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
     # which would be mistaken for a slow OU.
-    terms, worth = found.terms, found.worth
+    terms = found.terms
     step = float(np.median(samples.step[1:]))
     for octaves in _FINER:
         nearby = [(k, near) for k, term in enumerate(terms) if isinstance(term, LoadTransient)
@@ -106,10 +105,10 @@ def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> Mea
         if not nearby:
             break
         pool = [*terms, *(term for _, term in nearby)]
-        chosen, worth = _Regression(samples, composite, pool).exchanged(
+        chosen = _Regression(samples, composite, pool).exchanged(
             len(terms), [k for k, _ in nearby])
         terms = tuple(pool[k] for k in chosen)
-    return MeanResponse(terms, worth, found.rivals)
+    return MeanResponse(terms, found.rivals)
 
 
 def _nearby(term: LoadTransient, octaves: float, step: float) -> list[Term]:
@@ -188,12 +187,8 @@ class _Regression:
             chosen = max((self._less(chosen, k) for k in chosen),
                          key=lambda less: self._evaluate(less)[0])
         chosen = self._moved(chosen)
-        chosen = self._with_plainer_term(chosen)
-        worth = self._worth(chosen)
-        order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
-        found = [chosen[k] for k in order.tolist()]
+        found = sorted(chosen, key=lambda k: self._evidence(self._less(chosen, k)))
         return MeanResponse(tuple(self._pool[k] for k in found),
-                            tuple(worth[k] for k in order.tolist()),
                             tuple(self._rivals(chosen, k) for k in found))
 
     def _moved(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
@@ -210,9 +205,8 @@ class _Regression:
         return any(_is_near(one, other)
                    for one, other in combinations([self._pool[k] for k in chosen], 2))
 
-    def exchanged(self, own: int, places: Sequence[int]
-                  ) -> tuple[tuple[int, ...], tuple[float, ...]]:
-        """Replace any of the first `own` terms by a better later one; return terms and worth."""
+    def exchanged(self, own: int, places: Sequence[int]) -> list[int]:
+        """Replace any of the first `own` terms by a better later one."""
         # places: for each later term, the index of the term that it may replace.
         self._apart = True
         chosen = list(range(own))
@@ -220,13 +214,7 @@ class _Regression:
             other = [*chosen[:place], k, *chosen[place + 1:]]
             if self._evidence(tuple(other)) > self._evidence(tuple(chosen)) + decision.TIE:
                 chosen = other
-        kept = tuple(chosen)
-        return kept, self._worth(kept)
-
-    def _worth(self, chosen: tuple[int, ...]) -> tuple[float, ...]:
-        """Return the evidence lost without each term, nats."""
-        return tuple(self._evidence(chosen) - self._evidence(self._less(chosen, k))
-                     for k in chosen)
+        return chosen
 
     def _best_move(self, chosen: tuple[int, ...]) -> tuple[int, ...] | None:
         """Return the set after the most useful change; None if no change helps."""
@@ -279,7 +267,6 @@ class _Regression:
         return tuple(sorted((*kept, k)))
 
     def _evidence(self, chosen: tuple[int, ...]) -> float:
-        """Return the evidence for a set of terms, nats."""
         if self._apart and self._has_twins(chosen):
             return -math.inf
         return self._evaluate(chosen)[0]
@@ -298,28 +285,14 @@ class _Regression:
         """Return whether the larger set gains in more than one block."""
         return decision.is_shared(self._evaluate(less)[1] - self._evaluate(more)[1])
 
-    def _with_plainer_term(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the set with a term replaced by a plainer one that fits as well, if any."""
-        for k in chosen:
-            plain = [j for j in self._substitutes(chosen, k)
-                     if decision.is_plainer(type(self._pool[j]), type(self._pool[k]))]
-            if plain:
-                less = self._less(chosen, k)
-                return self._with_term(less, max(
-                    plain, key=lambda j: self._evidence(self._with_term(less, j))))
-        return chosen
-
-    def _substitutes(self, chosen: tuple[int, ...], k: int) -> list[int]:
-        """Return the terms of other kinds that fit about as well in the place of a term."""
-        value, less = self._evidence(chosen), self._less(chosen, k)
-        return [j for j, term in enumerate(self._pool)
-                if type(term) is not type(self._pool[k]) and j not in chosen
-                and len(self._with_term(less, j)) == len(chosen)
-                and self._evidence(self._with_term(less, j)) > value - decision.TIE]
-
     def _rivals(self, chosen: tuple[int, ...], k: int) -> tuple[str, ...]:
-        """Return the causes that fit about as well in the place of a term."""
-        return tuple(dict.fromkeys(self._pool[j].NAME for j in self._substitutes(chosen, k)))
+        """Return the other causes that fit about as well in the place of a term."""
+        value, less = self._evidence(chosen), self._less(chosen, k)
+        return tuple(dict.fromkeys(
+            term.NAME for j, term in enumerate(self._pool)
+            if type(term) is not type(self._pool[k]) and j not in chosen
+            and len(self._with_term(less, j)) == len(chosen)
+            and self._evidence(self._with_term(less, j)) > value - decision.TIE))
 
 
 def _losses(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> FloatArray:

@@ -27,10 +27,9 @@ from ou_monitor.discovery.regression import load_terms, mean_response
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import (
-    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma, LoadSag, LoadTransient)
+    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma, LoadSag)
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.slow import ACCoupling
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.model.terms.tones import lines_of, Tone
 from ou_monitor.records import FloatArray
@@ -86,7 +85,10 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         best = trials[0]
         if decision.is_latent(catalogue()[best.name]):
             search.before_accepted[best.name] = criticise(fitter.samples, search.composite, bank)
-        _accept(search, best, trials)
+        search.rivals[best.name] = decision.rivals_of(
+            best.name, [(trial.name, trial.evidence) for trial in trials])
+        search.composite = best.composite
+        search.accepted += [name for name in (best.beside, best.name) if name]
         if catalogue()[best.name].ROLE is Role.LAW or catalogue()[best.name].FAMILY == 'line':
             # Outliers and lines may have hidden smaller effects until now: try all kinds again.
             fitter.failed.clear()
@@ -189,13 +191,6 @@ def _needed(fitter: Fitter, model: Composite, name: str, least: float = decision
     less = _without(fitter, model, other)
     worth = fitter.evidence(model) - (0.0 if less is None else fitter.evidence(less))
     return max(least, decision.CURVE * worth)
-
-
-def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
-    search.rivals[best.name] = decision.rivals_of(
-        best.name, [(trial.name, trial.evidence) for trial in trials])
-    search.composite = best.composite
-    search.accepted += [name for name in (best.beside, best.name) if name]
 
 
 def _more_lines(fitter: Fitter, search: Search) -> bool:
@@ -328,42 +323,6 @@ def under_load(fitter: Fitter, search: Search) -> None:
             search.rivals.setdefault(term.NAME, [])
     backward(fitter, search)
     choose_response(fitter, search, ())
-    _try_ac_coupling(fitter, search)
-
-
-def _try_ac_coupling(fitter: Fitter, search: Search) -> None:
-    """Replace transients by a sag behind an AC coupling if that fits better; ties are rivals."""
-    composite = search.composite
-    means = [term for term in composite.terms if decision.is_response(type(term))]
-    if ACCoupling.NAME not in catalogue() or not decision.only_to_changes(map(type, means)):
-        return
-    changes = [term for term in means if isinstance(term, LoadTransient)]
-    if any(term.delay > 0.0 for term in changes):
-        return
-    # The response to a step of throttle decays at the corner.
-    tau = max(term.tau for term in changes)
-    coupling = ACCoupling(0.5 / (math.pi * tau), 0.0)
-    ou, *others = [term for term in composite.terms if term not in means]
-    structural = [term for term in others if term.ROLE is not Role.LAW]
-    laws = [term for term in others if term.ROLE is Role.LAW]
-    fit = fitter.fit([coupling.beside(ou), *structural, LoadSag(0.0, 0.0), coupling, *laws],
-                     composite)
-    # Behind a coupling, even a trend appears to relax.
-    if fit is None or is_trend(fitter.samples, fit):
-        return
-    # The corner comes from the search for the time constant, whose penalty it must pay too.
-    gain = fitter.evidence(fit) - fitter.evidence(composite) - LoadTransient.SEARCH
-    names = [term.NAME for term in means]
-    if abs(gain) < decision.TIE:
-        for name in names:
-            search.rivals[name] = [*search.rivals.get(name, []), ACCoupling.NAME]
-    if gain < decision.TIE:
-        return
-    search.composite = fit
-    search.accepted = [LoadSag.NAME, ACCoupling.NAME,
-                       *(name for name in search.accepted if name not in names)]
-    for name in (LoadSag.NAME, ACCoupling.NAME):
-        search.rivals[name] = []
 
 
 def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Composite | None:

@@ -8,14 +8,11 @@ import math
 import re
 from typing import Any
 
-from ou_monitor.discovery.decision import CHANCE
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
-from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import LARGEST_LOG_SE
-from ou_monitor.text import chance as shown_chance, listed, number, p_words, volts, Z95
+from ou_monitor.text import chance as shown_chance, listed, number, Z95
 
 # Explanation of gains and of the errors printed beside them.
 GAIN = ('Gain: log predictive density of samples not used for the fit, in mnat (thousandths of a '
@@ -50,10 +47,6 @@ _PLAIN = ((
     ('state', 'the restoring force is not proportional to the deviation'),
     ('growing effect', 'the effect of throttle on the mean changes with time'),
     ('loop of throttle', 'the mean depends on whether throttle rose or fell before'),
-    ('after large', 'the voltage after a large error does not follow the relaxation'),
-    ('power after large', 'a large error is followed by more noise, or by less'),
-    ('irreversibility', 'the process is not symmetric in time'),
-    ('small errors', 'neighbouring small errors are correlated'),
     ('bursts', 'power at some frequencies comes and goes'),
     ('products of three', 'neighbouring errors are dependent beyond their spectrum'),
     ('pairs', 'large errors are followed by related ones'))
@@ -65,7 +58,7 @@ def plain_words(statistic: str) -> str:
     return max(fits)[1] if fits else statistic
 
 
-# Maximum number of values in a printed list, and of tones printed with all their parameters.
+# Maximum number of values in a printed list.
 _LISTED = 6
 
 
@@ -133,19 +126,18 @@ def is_vague(value: Any, error: Any) -> bool:
             and 0.0 < LARGEST_LOG_SE * value < error)
 
 
-def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
-            alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
-            chance: float = math.nan) -> str:
-    """Return an explanation of a cause: meaning, estimate, gain (nats) and remedy."""
+def explain(term: Term, se: Mapping[str, Any], alternatives: Sequence[str], exact: bool = False,
+            why: str = '', together: int = 1) -> str:
+    """Return an explanation of a cause: meaning, estimate, why its gain is unknown, remedy."""
     # If several terms share a row, use the texts of their class, not of one term.
     about = type(term) if together > 1 else term
     parts = [about.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('The samples themselves show it, without a model.')
-    if not exact or gain != 0.0:
-        parts.append(gain_words(gain, gain_se, why, math.nan if exact else chance))
-    if together > 1 and math.isfinite(gain):
-        parts.append(f'That is the joint gain of all {together} {term.NAME} terms.')
+    if why:
+        parts.append(f'Its gain cannot be measured on this recording: {why}')
+    elif together > 1:
+        parts.append(f'Its gain is the joint gain of all {together} {term.NAME} terms.')
     if alternatives:
         separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
                     for name in (term.NAME, *alternatives)]
@@ -178,12 +170,6 @@ def no_relaxation_note(alpha: float, step: float) -> str:
             'is only a lower bound.')
 
 
-def coupling_found(duration: float) -> str:
-    """Return what would confirm an AC coupling that was found."""
-    return (f'An AC coupling was found in a recording of {number(duration)} s. The evidence is '
-            '0.24 nats per relaxation time; a DC-coupled recording would settle it.')
-
-
 def remaining_words(left: Sequence[Criticism]) -> str:
     """Return the largest remaining discrepancies, in words."""
     texts = list(dict.fromkeys(plain_words(c.statistic) for c in left))
@@ -195,7 +181,7 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
     """Return the verdict as sentences: causes, gain, whether simulations pass, refusal."""
     # why: reason for an unknown gain; uncovered: samples at a throttle that other blocks lack.
     if not found.causes:
-        return (plain(by_load(_without_causes(found, dropped, uncovered), found.load)),)
+        return (by_load(_without_causes(found, dropped, uncovered), found.load),)
     order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
     names = list(dict.fromkeys(
         both_names(cause.name, plain_name(cause.term)) for cause in order))
@@ -218,7 +204,8 @@ def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> s
     left = remaining_words(found.remaining)
     return ('The simulation deviates from the recording, and no known cause explains it: '
             + f'{left}.' + (
-                f' The nearest causes of the catalogue ({listed(list(dropped))}) explain a part.'
+                ' The nearest causes of the catalogue '
+                f'({listed([both_names(name) for name in dropped])}) explain a part.'
                 if dropped else '') + (
                 f' {uncovered} samples are at a throttle that the rest of the recording does not '
                 'cover; this alone may explain the deviation.' if uncovered else ''))
@@ -227,15 +214,18 @@ def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> s
 def _gain(found: Finding, why: str) -> str:
     """Return a gain in words: how much one-step errors, and predictions of their size, improve."""
     gain, shrink, size = found.gain, found.shrink, found.size_gain
-    if not gain > Z95 * found.gain_se or not math.isfinite(size):
-        return gain_words(gain, found.gain_se, why)
+    if not math.isfinite(gain):
+        return f'Its gain cannot be measured on this recording{f": {why}" if why else "."}'
+    whole = f'{gain_text(gain, found.gain_se)} mnat per sample'
+    if not gain > Z95 * found.gain_se:
+        what = 'Worse' if gain < -Z95 * found.gain_se else 'No measurable gain'
+        return f'{what} on samples not used for the fit ({whole}).'
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
     # Errors may grow although predictions improve: a few large errors dominate their rms.
     parts = (f'; {"+" * (shrink > 0.0)}{number(1e3 * (gain - size))} mnat per sample) and their '
              f'size is predicted better (+{number(1e3 * size)}): ' if size > Z95 * found.gain_se
              else '), a gain of ')
-    return (f'On samples not used for the fit, one-step errors {errors} (rms{parts}'
-            f'{gain_text(gain, found.gain_se)} mnat per sample in all.')
+    return f'On samples not used for the fit, one-step errors {errors} (rms{parts}{whole} in all.'
 
 
 def collinear_note(inflation: float, limit: float) -> str:
@@ -244,21 +234,6 @@ def collinear_note(inflation: float, limit: float) -> str:
             f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
             'apart, so the errors of the response are larger. Return to a low throttle between '
             'the steps.')
-
-
-def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.nan) -> str:
-    """Return the gain in words, and if it is not significant, why the cause is still named."""
-    named = '' if math.isnan(chance) else (
-        f' Named because it explains the whole recording better ({p_words(chance)}).'
-        if chance <= CHANCE else ' Named because without it the OU term would fit the trend.')
-    if not math.isfinite(gain):
-        return f'Its gain cannot be measured on this recording{f": {why}" if why else "."}{named}'
-    size = f'{gain_text(gain, gain_se)} mnat per sample'
-    if gain > Z95 * gain_se:
-        return f'Gain on samples not used for the fit: {size}.'
-    if gain < -Z95 * gain_se:
-        return f'Worse on samples not used for the fit: {size}.{named}'
-    return f'No measurable gain on samples not used for the fit ({size}).{named}'
 
 
 def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
@@ -323,31 +298,11 @@ def _explanation(group: Sequence[Cause]) -> str:
     if len(group) == 1:
         return first.explanation
     own = f'Estimate: {parameters(first.term, first.se)}.'
-    every = _tones([cause.term for cause in group]) or 'Estimates: ' + ' '.join(
+    every = 'Estimates: ' + ' '.join(
         f'({k}) {parameters(cause.term, cause.se)}.' for k, cause in enumerate(group, 1))
     if own not in first.explanation:
         return f'{first.explanation} {every}'
     return first.explanation.replace(own, every, 1)
-
-
-def _tones(terms: Sequence[Term]) -> str:
-    """List tones by frequency, harmonics together; return '' for at most `_LISTED` tones."""
-    tones = [term for term in terms if isinstance(term, Tone)]
-    if len(tones) <= _LISTED:
-        return ''
-    comb = comb_of([tone.frequency for tone in tones])
-    orders = comb.harmonics if comb else (0,) * len(tones)
-    others = [f'{number(tone.frequency, 4)} Hz ({volts(tone.amplitude)})'
-              for tone, order in zip(tones, orders) if not order]
-    words = []
-    if comb:
-        largest = {order: max(tone.amplitude for tone, k in zip(tones, orders) if k == order)
-                   for order in sorted(set(orders) - {0})}
-        words = [f'{len(tones) - len(others)} are at multiples of '
-                 f'{number(comb.fundamental, 5)} Hz, so probably of one source: '
-                 + ', '.join(f'{order}x ({volts(top)})' for order, top in largest.items()) + '.']
-    return ' '.join([*words, *([f'Others: {", ".join(others)}.'] if others else []),
-                     'Amplitudes are peaks; --json has all parameters.'])
 
 
 PLAIN_NAMES = {
@@ -376,24 +331,6 @@ PLAIN_NAMES = {
     'tone': 'a spectral line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
-# Names with an underscore; the other names are English words, and stay as they are.
-_CODE = re.compile(r'(?<![\w(])(' + '|'.join(
-    name for name in sorted(PLAIN_NAMES, key=len, reverse=True) if '_' in name) + r')(?![\w)])')
-
-
-def plain(text: str) -> str:
-    """Return a text with the plain name of each cause before its name in code."""
-    said: set[str] = set()
-
-    def both(found: re.Match[str]) -> str:
-        name = found[1]
-        if name in said:
-            return PLAIN_NAMES[name]
-        said.add(name)
-        return both_names(name)
-
-    text = _CODE.sub(both, text)
-    return text[:1].upper() + text[1:]
 
 
 def by_load(text: str, load: str) -> str:

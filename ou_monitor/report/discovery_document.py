@@ -99,7 +99,7 @@ def _causes(finding: Finding) -> list[Part]:
              'is fitted again; its error comes from the scatter of block means. p: twice the '
              'smaller p-value of the likelihood ratio on the whole recording (corrected for the '
              'search) and of the gain. "Exact" causes are visible in the samples themselves; '
-             'causes whose effect was removed from the samples share one gain. Terms of one kind '
+             'those whose effect was removed from the samples have no gain. Terms of one kind '
              'that share a gain are one row.',
              legend=True)]
 

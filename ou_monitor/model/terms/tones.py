@@ -348,20 +348,6 @@ def power_spread(view: View, frequency: float, linewidth: float) -> float:
     return float((high - low) / middle)
 
 
-def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> float:
-    """Return a peak's excess over both sides, in standard errors; -inf if a side is missing."""
-    # rate, frequency and width in Hz.
-    power = np.abs(np.fft.rfft(z - z.mean()))[1:] ** 2
-    away = (np.fft.rfftfreq(z.size, 1.0 / rate)[1:] - frequency) / width
-    inside = power[np.abs(away) <= 0.5]
-    sides = [power[(sign * away > 1.0) & (sign * away < 2.5)] for sign in (-1.0, 1.0)]
-    if not inside.size or not all(side.size for side in sides):
-        return -math.inf
-    # The relative error of a mean of n exponential variables is 1 / sqrt(n).
-    return min(math.log(inside.mean() / side.mean()) / math.sqrt(1 / inside.size + 1 / side.size)
-               for side in sides)
-
-
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
     """Return frequency, Hz, and damping, 1/s, of broad spectral peaks of scores (rate in Hz)."""
     found = []
