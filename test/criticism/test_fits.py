@@ -1,20 +1,26 @@
 """Fits of many states and of laws, and starts of slow states from the spectrum."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
+from numpy.testing import assert_allclose
 from ou_monitor.criticism import structure
-from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.composite import _converged, fit_composite
+from ou_monitor.criticism.curves import bin_width, outline, stray
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import columns_of, evaluate, Events, solved, state_space
+from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.discovery.fitting import from_spectrum, standard_errors
 from ou_monitor.discovery.gain import guess
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 from ou_monitor.model.terms.shocks import Volatility
-from ou_monitor.model.terms.slow import FlickerNoise, SecondRelaxation
+from ou_monitor.model.terms.slow import ACCoupling, FlickerNoise, SecondRelaxation
 from ou_monitor.model.whittle import Ordinates
 import pytest
 from scipy.signal import lfilter
@@ -152,3 +158,119 @@ def test_ordinates_are_all_counted():
     assert total == z.size // 2 - 1
     assert float(seen.count @ seen.power) / total == pytest.approx(1.0, abs=4.0 / math.sqrt(total))
     assert np.all(np.diff(seen.omega) > 0.0) and seen.omega[-1] < math.pi
+
+
+def test_the_first_sample_behind_a_high_pass_has_the_law_of_its_throttle():
+    n = 50
+    throttle = np.linspace(0.1, 0.9, n)
+    samples = Samples(1e-3 * np.arange(n), np.random.default_rng(1).standard_normal(n), throttle)
+    ou, alpha = OU(60.0, 0.5, 5.0), LoadDependentAlpha(0.8)
+    plain = evaluate(samples, (ou, alpha))
+    space = state_space(samples, (ou, alpha, ACCoupling(3.0, 0.0)), None)[1]
+    rate = 2.0 * math.pi * 3.0
+    first = float(plain.variance[0])
+    # The same step from the first sample to the second says what alpha is at the first.
+    at_first = -1e3 * math.log(state_space(samples, (ou, alpha), None)[1].f[1, 0, 0])
+    share = rate / (rate + at_first)
+    assert_allclose(space.q[0] / first, [[1.0, share], [share, share]], rtol=0.02)
+    late = -1e3 * math.log(state_space(samples, (ou, alpha), None)[1].f[-1, 0, 0])
+    assert abs(rate / (rate + late) / share - 1.0) > 0.1
+
+
+def test_rivals_are_within_a_tie():
+    evidence = [('a', 5.0 + TIE), ('b', 5.0), ('c', 5.0 + 0.01), ('d', 9.0 + TIE)]
+    assert rivals_of('a', evidence) == ['c', 'd'] and rivals_of('d', evidence) == []
+
+
+def test_the_mean_is_seen_through_the_instrument():
+    """Columns of the load are high-passed; that of the level is the instrument's own."""
+    t = 0.01 * np.arange(300)
+    u = np.where(t >= 1.0, 0.8, 0.2)
+    samples = Samples(t, 5.0 - u, u)
+    ou, sag, coupling = OU(60.0, 0.5, 5.0), LoadSag(0.3, 0.1), ACCoupling(2.0, 0.0)
+    s = samples.segment(60.0, 0.5)
+    bare = columns_of(samples, (ou, sag), s)
+    shown = columns_of(samples, (ou, sag, coupling), s)
+    assert bare.shape == shown.shape == (300, 3)
+    assert_allclose(shown[:, 0], 1.0)
+    assert_allclose(shown[:, 1:], coupling.pass_through(bare[:, 1:], s), atol=1e-12)
+    assert np.abs(shown[:90, 1:]).max() < 1e-9 < np.abs(bare[:90, 1:]).min()
+    # What is kept from before is not touched.
+    assert_allclose(columns_of(samples, (ou, sag), s), bare)
+
+
+def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_samples():
+    """A tenth of the power apart in the mean logarithm and 1 % of a variance of the mean."""
+    one, zero = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+    fit = SimpleNamespace(variance=np.full(3, 4.0))
+
+    def same(push, error, before, power=1.0, moved=0.0, offset=None):
+        found = Events(push, error, np.full(3, power), np.ones(3))
+        return _converged(before, offset, found, np.full(3, moved), fit)
+    none = Events(zero, zero, np.ones(3), np.ones(3))
+    assert same(zero, zero, None) and same(zero, zero, none)
+    for push, error in ((one, zero), (zero, one)):
+        assert not same(push, error, None) and not same(push, error, none)
+        assert same(9.0 * push, 9.0 * error, Events(push, error, np.ones(3), np.ones(3)))
+        assert not same(zero, zero, Events(push, error, np.ones(3), np.ones(3)))
+    assert same(zero, zero, None, moved=0.199) and not same(zero, zero, None, moved=0.201)
+    assert same(zero, zero, None, moved=5.1, offset=np.full(3, 5.0))
+    assert not same(zero, zero, None, power=4.0)
+
+
+@pytest.mark.parametrize('width', (3, 400))
+def test_least_squares_agree_for_few_and_for_many_columns(width):
+    rng = np.random.default_rng(7)
+    columns, y = rng.standard_normal((1000, width)), rng.standard_normal(1000)
+    columns[:, 1] = 0.0
+    columns *= np.geomspace(1.0, 1e3, width)
+    both = np.column_stack((y, columns))
+    assert_allclose(solved(both.T @ both)[0], np.linalg.pinv(columns) @ y, atol=1e-9)
+
+
+def test_events_add_to_the_joint_normal_law():
+    rng = np.random.default_rng(9)
+    n, alpha, sigma, u0 = 40, 1.3, 0.5, 5.0
+    t = np.cumsum(rng.choice([0.1, 0.2, 0.5], n))
+    v = u0 + 0.4 * rng.standard_normal(n)
+    push, error, power = np.zeros(n), np.zeros(n), np.ones(n)
+    push[9], error[20], power[30:33] = 0.7, 0.9, 3.0
+    std, white = 0.2, np.where(np.arange(n) // 4 == 4, 5.0, 1.0)
+    found = evaluate(Samples(t, v, None), [OU(alpha, sigma, u0), MeasurementNoise(std)],
+                     Events(push, error, power, white))
+    keep = np.append(0.0, np.exp(-alpha * np.diff(t)))
+    added = power * sigma**2 / (2.0 * alpha) * (1.0 - keep**2) + push
+    spread = np.zeros(n)
+    for k in range(n):
+        spread[k] = (keep[k]**2 * spread[k - 1] if k else 0.0) + added[k]
+    decay = np.exp(-alpha * np.abs(t[:, None] - t))
+    covariance = decay * spread[np.minimum.outer(np.arange(n), np.arange(n))] + np.diag(
+        error + white * std**2)
+    known = np.linalg.cholesky(covariance)
+    assert_allclose(found.innovation, np.diag(known) * np.linalg.solve(known, v - u0), atol=1e-4)
+    # What an event adds at its own sample is not in the variance there.
+    own = (power - 1.0) / power * (added - push) + push + error + (white - 1.0) * std**2
+    assert_allclose(found.variance, np.diag(known)**2 - own, rtol=1e-3)
+
+
+@pytest.mark.parametrize('n, spread', [(27, 1.0), (1000, 0.02)])
+def test_bins_after_freedman_and_diaconis(n, spread):
+    """2 IQR n^(-1/3): of even values the quartiles are half the range apart."""
+    width = bin_width(np.linspace(5.0, 5.0 + spread, n))
+    assert width == pytest.approx(spread / n ** (1.0 / 3.0))
+
+
+def test_the_outline_of_a_histogram_encloses_the_area_of_its_bars():
+    """Up, along, down: the area below is that of the bars."""
+    x, y = outline(np.array([0.0, 1.0, 3.0]), [2.0, 1.0])
+    assert float(np.sum(np.diff(x) * 0.5 * (y[1:] + y[:-1]))) == pytest.approx(4.0)
+    assert x[0] == 0.0 and x[-1] == 3.0 and y.max() == 2.0
+
+
+def test_simulations_may_exceed_the_recorded_range_by_half_of_it():
+    """Seen 14 to 16 V: 13 to 17 V may be simulated, and what is farther is said in volts."""
+    seen = np.array([14.0, 15.0, 16.0])
+    assert stray(np.array([[13.0, 17.0], [15.0, 15.5]]), seen) == 0.0
+    assert stray(np.array([[15.0, 17.3], [15.0, 15.5]]), seen) == pytest.approx(0.3)
+    assert stray(np.array([12.5, 17.2]), seen) == pytest.approx(0.5)
+    assert stray(np.array([np.nan, 15.0]), seen) == float('inf')

@@ -9,28 +9,23 @@ every bag and of every recorded run there is, tables and raw logs.
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_result import fit_all, fit_parts
-from ou_monitor.analysis.level_tests import alpha_constancy, sigma_change
-from ou_monitor.analysis.levels import find_levels, LevelSegment
+from ou_monitor.analysis.level_result import fit_all
+from ou_monitor.analysis.levels import find_levels
 from ou_monitor.analysis.supply import remainder
-from ou_monitor.criticism.composite import fit_composite, view_of
+from ou_monitor.criticism.composite import view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.score_statistics import covariates_of, statistics
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.model.spectral_lines import find_lines, on_grid
-from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.slow import ACCoupling, SecondRelaxation
-from ou_monitor.recordings.importers.csv_table import CsvColumns
+from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import Recording
 from project import REAL, recorded, ROOT
 import pytest
-from simulated_recordings import as_one_level, bare
+from simulated_recordings import as_one_level
 
 PATHS = [*sorted(path.parent for path in (ROOT / 'bags').glob('**/metadata.yaml')),
          *sorted(REAL.glob('*.csv')), *sorted((REAL / 'raw').glob('*.[bBu]*'))]
@@ -107,54 +102,3 @@ def test_another_pole_is_the_same(both):
         ours, theirs = (getattr(pole, name) for pole in found)
         assert (ours < FAMILY_WISE) == (theirs < FAMILY_WISE)
         assert math.isclose(ours, theirs, rel_tol=0.05, abs_tol=1e-3)
-
-
-RATE, N = 1000.0, 12_000
-T = np.arange(N) / RATE
-RAIL = OU(63.0, 0.3, 5.0)
-SLOW = SecondRelaxation(4.0, 0.04)
-COUPLED = ACCoupling(1.0, 5.0)
-
-
-def fitted(*terms, throttle=None, seed=0):
-    """Return samples of a model and the plain OU fitted to them."""
-    voltage = SupplyModel((RAIL, *terms)).simulate(T, np.random.default_rng(seed), throttle)
-    samples = Samples(T, voltage, throttle)
-    return samples, fit_composite(samples, [RAIL], slice(0, N))
-
-
-def over_throttle(*terms, seed):
-    """Return what both verbs make of two levels: scores of alpha and of sigma, in pairs."""
-    throttle = np.repeat([0.2, 0.6], N // 2)
-    samples, composite = fitted(*terms, throttle=throttle, seed=seed)
-    found = statistics(composite.z, covariates_of(samples, composite))
-    recording = Recording(samples.t, samples.voltage, throttle, 'levels')
-    low, high = (fit_parts(recording, bare(recording), [LevelSegment(*ends)])[1]
-                 for ends in ((0, N // 2), (N // 2, N)))
-    alpha, sigma = alpha_constancy((0.2, 0.6), (low, high)), sigma_change(low, high)
-    reach = math.log(sigma.ratio_high / sigma.ratio)
-    return ((math.copysign(math.sqrt(alpha.statistic), math.log(alpha.ratio)),
-             -found['state throttle']),
-            (1.96 * math.log(sigma.ratio) / reach, found['variance throttle']))
-
-
-@pytest.mark.parametrize('slope', [0.0, 0.6])
-def test_alpha_over_throttle_is_the_same(slope):
-    """
-    The levels' chi of ln alpha and the score of the whole recording, to first order one statistic.
-
-    Their difference, which second order and the other fit make, has a root mean square of 0.3
-    over 10 recordings (measured); independent ones would differ by 1.4.
-    """
-    pairs = np.array([over_throttle(LoadDependentAlpha(slope), seed=seed)[0]
-                      for seed in range(10)])
-    assert float(np.sqrt(np.mean(np.diff(pairs, axis=1) ** 2))) < 0.5
-    if slope:
-        assert pairs.mean(axis=0).min() > 1.5
-
-
-def test_sigma_over_throttle_is_the_same():
-    """Sigma 10 % higher at one level: both verbs see it, the score of the whole sharper."""
-    for seed in range(5):
-        levels, whole = over_throttle(LoadDependentSigma((0.2, 0.6), (0.0, 0.1)), seed=seed)[1]
-        assert 1.96 < levels < whole

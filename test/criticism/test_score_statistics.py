@@ -1,10 +1,17 @@
 """Statistics of scores: N(0, 1) without an effect, and far off with one."""
 
+import math
+
 import numpy as np
-from numpy.testing import assert_allclose
-from ou_monitor.criticism.score_statistics import after_large, large_signs, score, throttle_paths
+from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.score_statistics import (
+    _PRIOR, criticise, family_chance, family_edge,
+    is_sign, score, simulate_bank, SIZE, throttle_paths)
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ou import OU
 import pytest
-from scipy.stats import kstest
+
 
 N = 8000
 KEEP = 0.9
@@ -56,52 +63,48 @@ def test_an_effect_of_throttle_that_grows_is_detected():
     assert statistics_of['growing effect of throttle'] > 5.0
 
 
-def test_large_ones_are_the_first_of_each_group_and_what_laws_have_found():
-    errors = np.zeros(200)
-    # One 20 samples after the last belongs to its group, 21 after it does not; 3.99 is not large.
-    errors[[0, 20, 41, 62, 150]] = 5.0, -6.0, -4.01, 3.99, 4.5
-    found = np.zeros(200, bool)
-    found[100] = True
-    errors[100] = -1.0
-    large = large_signs(errors, found)
-    assert_allclose(np.flatnonzero(large), [0, 41, 100, 150])
-    assert_allclose(large[[0, 41, 100, 150]], [1.0, -1.0, -1.0, 1.0])
+RATE = 512.0
 
 
-def test_after_large_errors_of_independent_scores_nothing_follows():
-    # 400 draws of independent scores with planted large ones: N(0, 1), by its law.
-    rng = np.random.default_rng(4)
-    values = {}
-    for _ in range(400):
-        w = rng.standard_normal(N)
-        w[rng.integers(0, N, 20)] = rng.choice([-5.0, 5.0], 20)
-        square = w * w - np.mean(w * w)
-        for name, value in after_large(w, square, large_signs(w)):
-            values.setdefault(name, []).append(value)
-    assert len(values) == 10
-    for name, drawn in values.items():
-        # 10 tests: one in 10 000 each.  Windows of few samples hold squares of few: not normal.
-        if not name.startswith('power after large errors 1 '):
-            assert kstest(drawn, 'norm').pvalue > 1e-4, name
-        assert np.std(drawn) == pytest.approx(1.0, abs=4.5 / np.sqrt(2 * 400) * 1.5), name
+def test_a_sign_has_its_direction():
+    for sign, name, value, wanted in (
+            ('+kurtosis', 'kurtosis', 1.0, True), ('+kurtosis', 'kurtosis', -1.0, False),
+            ('-kurtosis', 'kurtosis', -1.0, True), ('-kurtosis', 'kurtosis', 1.0, False),
+            ('-kurtosis', 'kurtosis', 0.0, True), ('+band', 'skewness', 1.0, False),
+            ('band', 'band 3, 1 to 2 Hz', -1.0, True), ('band', 'band 0, 1 to 2 Hz', 1.0, True),
+            ('band', 'order line', 1.0, False)):
+        assert is_sign(sign, name, value) is wanted, (sign, name, value)
 
 
-@pytest.mark.parametrize('sign', (1.0, -1.0))
-def test_a_ramp_after_each_large_error_is_detected_with_its_sign(sign):
-    rng = np.random.default_rng(5)
-    w = rng.standard_normal(N)
-    for at in range(300, N - 300, 400):
-        w[at] = 6.0 * sign
-        w[at + 16:at + 64] += 0.5 * sign
-    statistics_of = dict(after_large(w, w * w - np.mean(w * w), large_signs(w)))
-    # 19 windows of 48 samples: 0.5 sqrt(912) = 15 standard deviations.
-    assert statistics_of['after large errors 16 to 64'] == pytest.approx(15.1, abs=4.0)
-    assert abs(statistics_of['after large errors 256 to 1024']) < 5.0
+def test_a_score_by_a_spread_of_few_draws_has_heavy_tails():
+    """Of 4 million scores divided as `_summary` does: the share beyond 3.5."""
+    # To four standard errors; the normal law would be 10 of them off.
+    rng = np.random.default_rng(1)
+    weight = SIZE / (SIZE + _PRIOR)
+    drawn = weight * rng.chisquare(SIZE - 1, 40_000) / (SIZE - 1) + 1.0 - weight
+    beyond = np.abs(rng.standard_normal((100, 40_000))) > 3.5 * np.sqrt(drawn)
+    share, error = float(beyond.mean()), math.sqrt(float(beyond.mean()) / beyond.size)
+    assert abs(share - family_chance(3.5, 1)) < 4.0 * error
+    assert share > math.erfc(3.5 / math.sqrt(2.0)) + 10.0 * error
 
 
-def test_few_large_errors_are_not_tested_and_short_recordings_have_no_long_windows():
-    w = np.random.default_rng(6).standard_normal(300)
-    statistics_of = dict(after_large(w, w * w - 1.0, np.zeros(300)))
-    assert set(statistics_of.values()) == {0.0}
-    assert 'after large errors 16 to 64' in statistics_of
-    assert 'after large errors 64 to 256' not in statistics_of
+@pytest.mark.parametrize('chance', [0.05, 0.01, 0.001])
+@pytest.mark.parametrize('count', [1, 30, 70])
+def test_the_edge_is_where_the_chance_is(chance, count):
+    assert family_chance(family_edge(chance, count), count) == pytest.approx(chance, rel=1e-9)
+    assert family_chance(-family_edge(chance, count), count) == pytest.approx(chance, rel=1e-9)
+
+
+def test_of_plain_recordings_few_are_off():
+    t, found = np.arange(2000) / 200.0, []
+    for seed in range(30):
+        rng = np.random.default_rng([7, seed])
+        throttle = np.repeat(rng.random(50), 40)
+        voltage = SupplyModel((OU(20.0, 0.3, 15.0),)).simulate(t, rng, throttle)
+        samples = Samples(t, voltage, throttle)
+        plain = fit_composite(samples, [OU(20.0, 0.3, 15.0)], samples.train)
+        bank = simulate_bank(samples, plain, rng)
+        scores = criticise(samples, plain, bank)
+        found.append(family_chance(max(map(abs, scores.values())), len(scores)))
+    assert np.sum(np.array(found) < 0.05) <= 5
+    assert np.median(found) < 0.9

@@ -205,18 +205,3 @@ def test_a_cause_stays_if_its_gain_and_its_p_value_allow(gain, error, chance, ea
 def test_a_latent_cause_is_tested_by_its_own_signs_only(measured, before, asked, after, out):
     found = decision.withdrawn(before, after, [measured, Cheap, measured], {Cheap.NAME: asked})
     assert found == out
-
-
-@pytest.mark.parametrize('one, other, plainer', [
-    ('load_sag', 'load_transient', True), ('load_transient', 'load_sag', False),
-    ('load_sag', 'load_sag', False), ('drift', 'load_transient', False)])
-def test_a_tie_goes_to_the_cause_with_less_search(one, other, plainer):
-    """Within a family: of a sag and a lag that do as well, the sag."""
-    assert decision.is_plainer(catalogue()[one], catalogue()[other]) is plainer
-
-
-@pytest.mark.parametrize('names, changes', [
-    (['load_transient'], True), (['load_transient', 'load_transient', 'drift'], True),
-    (['load_transient', 'load_sag'], False), (['drift'], False), ([], False)])
-def test_a_mean_of_transients_alone_responds_only_to_changes(names, changes):
-    assert decision.only_to_changes(catalogue()[name] for name in names) is changes

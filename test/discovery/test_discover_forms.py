@@ -13,7 +13,6 @@ from ou_monitor.model.terms.ou import NonlinearRestoring, OU
 from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 from ou_monitor.model.terms.shocks import Glitches
-from ou_monitor.model.terms.slow import ACCoupling
 from ou_monitor.model.terms.term import View
 from ou_monitor.model.terms.tones import order_lines
 import pytest
@@ -138,17 +137,3 @@ def test_jitter_that_only_a_line_shows_is_named(noise):
     assert set(found) == {'tone', 'clock_jitter', *(('measurement_noise',) if noise else ())}
     # 9000 squares, half of them informative: 2 % by chance.
     assert found['clock_jitter'].std == pytest.approx(std, rel=0.08)
-
-
-def test_a_sag_behind_an_ac_coupling_is_named():
-    """The mean answers to changes only: transients say so too, but not what the noise says."""
-    rng, n, rate = np.random.default_rng(7), 12000, 200.0
-    t = np.arange(n) / rate
-    throttle = 0.4 + rail(rng, n, 2.0, rate, 0.1)
-    made = SupplyModel((OU(6.0, 0.2, 16.0), LoadSag(1.4, 0.0), MeasurementNoise(0.02),
-                        ACCoupling(3.0, 0.0)))
-    finding = discover(Recording(t, made.simulate(t, rng, throttle), throttle))
-    found = {cause.name: cause.term for cause in finding.causes}
-    assert set(found) == {'load_sag', 'ac_coupling', 'measurement_noise'}
-    assert found['ac_coupling'].corner == pytest.approx(3.0, rel=0.15)
-    assert found['load_sag'].linear == pytest.approx(1.4, rel=0.1)

@@ -10,7 +10,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import gain as gains
 from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, blocks_of, cause_gain, covered, gain_of, guess, held_out, HeldOut, if_known,
+    BLOCKS, blocks_of, cause_gain, covered, gain_of, held_out, HeldOut, if_known,
     mean_difference, mean_score, why_unknown, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.load_response import LoadSag
@@ -155,35 +155,6 @@ def test_a_gain_needs_as_many_samples_as_blocks():
             a, b = held(new, known=masks[0]), held(old, known=masks[1])
             assert math.isfinite(gain_of(a, b, masks[2])[0]) == known
             assert (why_unknown(a, b, masks[2], False) == '') == known
-
-
-def test_the_error_of_a_mean_comes_from_24_blocks():
-    """24 blocks; a lag adds half of itself where it is positive; what is over is left out."""
-    rng = np.random.default_rng(2)
-    for keep in (0.9, -0.9):
-        blocks = np.zeros(24)
-        for k in range(1, 24):
-            blocks[k] = keep * blocks[k - 1] + rng.standard_normal()
-        d = np.concatenate((np.repeat(blocks, 3), [9.0] * 20))
-        mean, error = mean_difference(d, np.zeros(d.size))
-        c = blocks - blocks.mean()
-        shared = max(0.0, (c[1:] * c[:-1]).sum() / 23.0)
-        assert mean == pytest.approx(d.mean())
-        assert error == pytest.approx(math.sqrt((blocks.var(ddof=1) + shared) / 24.0))
-
-
-def test_the_first_guess_is_an_autoregression():
-    t = np.arange(20_000) * 1e-3
-    v = simulate(t, 63.0, 0.3, np.random.default_rng(5), u0=5.0)
-    c = v - v.mean()
-    found = guess(Samples(t, v, None))
-    alpha = -1e3 * math.log((c[1:] @ c[:-1]) / (c @ c))
-    assert found.values() == pytest.approx(
-        {'alpha': alpha, 'sigma': v.std() * math.sqrt(2.0 * alpha), 'u0': v.mean()})
-    white = guess(Samples(t, np.random.default_rng(6).standard_normal(t.size), None))
-    assert white.alpha == pytest.approx(-1e3 * math.log(0.05))
-    slow = guess(Samples(t, np.cos(0.1 * t), None))
-    assert 0.1 < slow.alpha < 0.2
 
 
 def test_a_cause_loses_no_more_than_without_further_states(monkeypatch):

@@ -50,7 +50,7 @@ def test_a_sag_is_found_and_its_gain_measured(sag):
     (cause,) = sag.causes
     fall = cause.term.linear + cause.term.square
     assert abs(fall - 0.5) < 4.0 * math.hypot(*cause.se.values())
-    assert cause.measurable and cause.p_value < 1e-6
+    assert cause.gain > 1.96 * cause.gain_se and cause.p_value < 1e-6
     assert cause.gain == pytest.approx(sag.gain) and sag.score > sag.baseline_score
     ou = sag.model.ou
     assert abs(ou.alpha - RAIL.alpha) < 4.0 * sag.se[0]['alpha']

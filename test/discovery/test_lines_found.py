@@ -12,14 +12,13 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import fitting
 from ou_monitor.discovery.fitting import Fitter, standard_errors
-from ou_monitor.discovery.named import _in_doubt, _SURE
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import HeavyTails
 from ou_monitor.model.terms.slow import SecondRelaxation
-from ou_monitor.model.terms.tones import prominence, Resonance, ThrottleTone, Tone
+from ou_monitor.model.terms.tones import Resonance, ThrottleTone, Tone
 from ou_monitor.records import NAN, Recording
 from project import needs_recordings, REAL, recorded
 import pytest
@@ -35,16 +34,6 @@ def voltage(*terms, throttle=None, seed=0):
     return SupplyModel((RAIL, *terms)).simulate(T, np.random.default_rng(seed), throttle)
 
 
-@pytest.mark.parametrize('amplitude, stays', [(0.006, False), (0.009, True)])
-def test_only_a_sure_line_is_never_withdrawn(amplitude, stays):
-    """Whatever else is left, a line of more than 25 standard errors is there."""
-    samples = Samples(T, voltage(Tone(amplitude, 13.0, 0.5, 0.0)), None)
-    whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
-    error = standard_errors(samples, whole, slice(0, samples.n))[1]['amplitude']
-    assert (amplitude > _SURE * error) == stays
-    assert _in_doubt(samples, whole, ['tone'], [0]) == ([] if stays else [0])
-
-
 def test_errors_of_a_singular_filter_are_infinite(monkeypatch):
     """Half of a recorded flight led to such a model, and the whole command ended."""
     samples = Samples(T, voltage(Tone(0.02, 13.0, 0.5, 0.0)), None)
@@ -56,21 +45,6 @@ def test_errors_of_a_singular_filter_are_infinite(monkeypatch):
     monkeypatch.setattr(fitting, 'whitened', singular)
     assert standard_errors(samples, whole, slice(0, samples.n))[1] == {
         'amplitude': math.inf, 'phase': math.inf}
-
-
-def test_ringing_that_stands_out_on_both_sides_is_never_withdrawn():
-    """A peak is no slope of the spectrum, and none where the spectrum ends."""
-    samples = Samples(T, voltage(Resonance(10.0, 6.0, 0.02, 0.0)), None)
-
-    def left(frequency, damping):
-        terms = (RAIL, Resonance(frequency, damping, 0.02, 0.0))
-        gaussian = evaluate(samples, terms)
-        whole = Composite(terms, ({}, {}), gaussian, gaussian.z, gaussian.density, 6, 0.0)
-        return _in_doubt(samples, whole, ['resonance'], [0])
-
-    assert left(10.0, 6.0) == []
-    # Beside the peak, on its flank, and so broad that there is nothing below it.
-    assert left(18.0, 6.0) == left(12.0, 6.0) == left(2.0, 6.0) == [0]
 
 
 @pytest.mark.parametrize('damping, rings', [(2.0, True), (60.0, False)])
@@ -127,15 +101,6 @@ def test_analyze_and_discover_name_the_same_lines_of_a_comb():
         assert sum(clear for _, clear in some) >= 5
         for frequency, clear in some:
             assert not clear or any(abs(frequency - other) < 2.0 for other, _ in others), frequency
-
-
-def test_a_peak_is_measured_in_standard_errors_of_its_neighbours():
-    """Five bins have e^2 times the power of five on either side: 2 / sqrt(1/5 + 1/5)."""
-    power = np.ones(51)
-    power[19:24] = math.e ** 2
-    power[0] = 0.0
-    z = np.fft.irfft(np.sqrt(power) * np.exp(1j * np.arange(51.0)))
-    assert prominence(z, float(z.size), 21.0, 4.0) == pytest.approx(math.sqrt(10.0))
 
 
 def test_white_noise_that_a_line_hid_is_no_second_relaxation():

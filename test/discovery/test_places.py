@@ -1,10 +1,11 @@
 """The search first finds input and place of an effect: rises of throttle, white noise."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor import discover, Recording
-from ou_monitor.discovery.gain import errors_grow
+from ou_monitor.discovery.gain import growth_of, HeldOut
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import (
     Inputs, INPUTS, LoadDependentNoise, LoadSag, LoadTransient)
@@ -153,6 +154,13 @@ def test_sigma_follows_where_the_load_shakes_the_rail():
     assert not found.larger and found.gain > 1.0 and found.shrink > -0.1
 
 
+def held(error):
+    """Return held-out errors of a model whose predictive variance is 1."""
+    ones = np.ones(error.size)
+    model = SimpleNamespace(gaussian=SimpleNamespace(variance=ones))
+    return HeldOut(model, ones, ones.astype(bool), error)
+
+
 def test_errors_grow_where_a_model_takes_a_wander_for_noise():
     """Not by chance: of right models 2.5 % have larger errors than another one, by 1.96 errors."""
     rng = np.random.default_rng(4)
@@ -162,6 +170,6 @@ def test_errors_grow_where_a_model_takes_a_wander_for_noise():
         e = rng.standard_normal((400, 500))
         x = lfilter([1.0], [1.0, -0.8], e, axis=1)
         other = 0.7 * x[:, :-1]
-        grown.append(np.mean([errors_grow(a[1:] - share * 0.8 * a[:-1], a[1:] - b, np.ones(499))
-                              for a, b in zip(x, other)]))
+        grown.append(np.mean([growth_of(held(a[1:] - share * 0.8 * a[:-1]), held(a[1:] - b),
+                                        np.ones(499, bool)) > 1.96 for a, b in zip(x, other)]))
     assert grown[0] < 0.025 and grown[1] == 1.0

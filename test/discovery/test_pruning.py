@@ -2,8 +2,8 @@
 
 from types import SimpleNamespace
 
-from ou_monitor.discovery import pruning
-from ou_monitor.discovery.pruning import Pruned, prune_by_gain, group_of, MANY, refusal, Worth
+from ou_monitor.discovery import named as pruning
+from ou_monitor.discovery.named import Pruned, prune_by_gain, refusal, Worth
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
@@ -44,26 +44,18 @@ def test_a_removed_cause_leaves_names_and_model_consistent(names, worst, less, s
     assert state.names == left and sorted(state.out) == out and state.full is rest
 
 
-def test_four_or_more_of_a_kind_share_one_gain():
-    """Up to three lines have a gain each, from four on one together."""
-    few, many = ['tone'] * (MANY - 1) + ['drift'], ['tone', 'drift'] + ['tone'] * (MANY - 1)
-    model = scored_model(*few).model
-    assert [group_of(model, few, k) for k in range(MANY)] == [(1,), (2,), (3,), (4,)]
-    model = scored_model(*many).model
-    assert group_of(model, many, 0) == group_of(model, many, 3) == (1, 3, 4, 5)
-    assert group_of(model, many, 1) == (2,)
-
-
-def run(monkeypatch, values, names):
+def run(monkeypatch, values, names, vague=()):
     """Return what is left, with (gain, chance) of each cause in each round; error 0.01."""
     rounds = iter(values)
     monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
-    monkeypatch.setattr(pruning, '_leave_out_vague', lambda samples, state: None)
+    monkeypatch.setattr(pruning, '_undetermined', lambda samples, state: [
+        k for k, name in enumerate(state.names) if name in vague])
     monkeypatch.setattr(pruning, '_cause_of_straying', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_absorbs_trend', lambda *given: False)
 
     def measure(samples, state, plain, scored, progress):
         table = next(rounds)
+        state.worth = []
         for k, name in enumerate(state.names):
             gain, chance = table[name]
             rest = [one for j, one in enumerate(state.names) if j != k]
@@ -73,22 +65,19 @@ def run(monkeypatch, values, names):
     return prune_by_gain(None, None, names, None, None, lambda share: None)
 
 
-@pytest.mark.parametrize('name, errors, left_out', [
+@pytest.mark.parametrize('name, errors, vague', [
     ('tone', {'amplitude': 0.1}, True), ('tone', {'amplitude': 0.001, 'frequency': 1e3}, False),
     ('second_relaxation', {'sigma': 1.0}, True), ('second_relaxation', {'alpha': 99.0}, False),
     ('drift', {'rate': 9.0}, False)])
-def test_a_cause_of_undetermined_size_is_left_out(name, errors, left_out, monkeypatch):
+def test_a_cause_of_undetermined_size_is_left_out(name, errors, vague, monkeypatch):
     """Its size has an error beyond the largest; others stay."""
-    state = state_of('measurement_noise', name)
     monkeypatch.setattr(pruning, 'standard_errors', lambda samples, model, part: [
         {}, {'std': 0.001}, errors])
-    monkeypatch.setattr(pruning, 'without', lambda samples, model, at: SimpleNamespace(
-        terms=model.terms[:at] + model.terms[at + 1:]))
-    monkeypatch.setattr(pruning, 'held_out', lambda samples, model: SimpleNamespace(model=model))
-    pruning._leave_out_vague(SimpleNamespace(n=9), state)
-    assert state.out == [name] * left_out and state.worth == []
-    assert state.names == ['measurement_noise', name][:2 - left_out]
-    assert len(state.full.model.terms) == 1 + len(state.names)
+    state = state_of('measurement_noise', name)
+    assert pruning._undetermined(SimpleNamespace(n=9), state) == [1] * vague
+    good = dict.fromkeys(state.names, (0.5, 0.0))
+    found = run(monkeypatch, [good, good], state.names, [name] * vague)
+    assert found.out == [name] * vague
 
 
 def test_the_worst_goes_first_and_the_others_are_measured_again(monkeypatch):
@@ -143,10 +132,3 @@ def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, mon
     assert said in text and bool(text) is bool(said)
     if gain > 0.0:
         assert 'errors' in refusal(None, (BASE,), gain, 0.01, larger=True)
-
-
-def test_after_four_rounds_what_is_left_stays(monkeypatch):
-    names = ['drift', 'tone', 'measurement_noise', 'second_relaxation']
-    bad = dict.fromkeys(names, (-0.1, 0.9))
-    found = run(monkeypatch, [bad] * 4, names)
-    assert len(found.names) == 1 and len(found.out) == 3

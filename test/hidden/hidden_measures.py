@@ -1,8 +1,6 @@
 """Simple direct measurements of a made recording, for the tests of the generator."""
 
-from collections.abc import Iterator
-
-from hidden_effects import draw, Hidden
+from hidden_effects import Hidden
 import numpy as np
 from scipy.signal import lfilter, welch
 
@@ -18,17 +16,6 @@ def whitened(h: Hidden) -> np.ndarray:
 def rate(h: Hidden) -> float:
     """Return the nominal sampling rate, 1/s."""
     return round((h.t.size - 1) / (h.t[-1] - h.t[0]))
-
-
-def regress(h: Hidden, *signals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients and standard errors of signals, shape (n,), in volts by innovations."""
-    rail = h.detail['rail']
-    phi = np.exp(-rail['alpha'] / rate(h))
-    basis = np.column_stack([s[1:] - phi * s[:-1] for s in (*signals, np.ones(h.t.size))])
-    basis /= rail['innovation_v']
-    cov = np.linalg.inv(basis.T @ basis)
-    # Scaled by 1 V, so that coefficients are volts.
-    return (cov @ (basis.T @ whitened(h)))[:-1], np.sqrt(np.diag(cov))[:-1]
 
 
 def late(h: Hidden, signal: np.ndarray, time: float) -> np.ndarray:
@@ -108,34 +95,3 @@ def signs(h: Hidden) -> dict[str, float]:
 def largest(z: dict[str, float]) -> tuple[float, str]:
     """Return the largest score and its name."""
     return max((abs(value), name) for name, value in z.items())
-
-
-def simulated(cause: str, seed: int = 0, **options: float) -> Hidden:
-    """Draw a recording by seed; names with a shape are variants."""
-    kind = 'variant' if '/' in cause else 'single'
-    return draw(kind, np.random.default_rng(seed), cause=cause, **options)
-
-
-def each(cause: str, count: int = 8,
-         **options: float) -> Iterator[tuple[Hidden, dict, dict]]:
-    """Yield recordings, their claimed parameters, and those of their rails."""
-    for seed in range(count):
-        h = simulated(cause, seed, **options)
-        yield h, h.detail[cause], h.detail['rail']
-
-
-def assert_as_claimed(ratios: list[float], room: float = 0.0,
-                      power: float = 0.15) -> None:
-    """Check that measured over claimed is 1 within 5 standard errors, which are below `power`."""
-    ratios = np.asarray(ratios)
-    error = ratios.std(ddof=1) / np.sqrt(ratios.size)
-    assert error < power, f'no power: {ratios}'
-    assert abs(ratios.mean() - 1) < 5 * error + room, ratios
-
-
-def assert_regression(h: Hidden, signals: list[np.ndarray],
-                      claimed: float | list[float]) -> None:
-    """Check coefficients, V, within 4.5 standard errors, and that one of them is beyond 4.5."""
-    found, error = regress(h, *signals)
-    assert np.all(np.abs(found - claimed) < 4.5 * error), (found, error, claimed)
-    assert np.max(np.abs(found) / error) > 4.5

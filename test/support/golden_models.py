@@ -1,27 +1,17 @@
 """Results of causes and of the criticism of models on made recordings, for golden tables."""
 
-from dataclasses import replace
 import math
 
 from golden_runs import flight, table
 import numpy as np
-from ou_monitor.analysis.level_tests import examine_level, holm
-from ou_monitor.criticism.composite import fit_composite, view_of
+from ou_monitor.criticism.composite import view_of
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.score_statistics import (
-    covariates_of, criticise, simulate_bank, simulate_bank_of, statistics)
-from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian
-from ou_monitor.discovery.decision import kinds_to_try
-from ou_monitor.discovery.fitting import Fitter, standard_errors
-from ou_monitor.discovery.gain import (
-    cause_gain, covered, gain_of, guess, held_out, without)
-from ou_monitor.discovery.load_effects import low_dips
-from ou_monitor.discovery.regression import load_terms, mean_response
+from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role
-from ou_monitor.records import Estimate, Recording, Status
+from ou_monitor.records import Recording
 from term_examples import EXAMPLES, OU, term
 
 
@@ -125,7 +115,7 @@ def integrity():
     for name, (t, v, u) in _recordings().items():
         made = examine(Recording(t, v, u, name))
         one = {'exact': [[term_.NAME, term_.values()] for term_ in made.exact],
-               'raw': made.raw is not None, 'notes': len(made.notes),
+               'notes': len(made.notes),
                'drawn': None if made.drawn is None else int(made.drawn.sum())}
         if made.samples is not None:
             s = made.samples
@@ -135,92 +125,4 @@ def integrity():
     return found
 
 
-def criticism():
-    """Return fits, statistics, banks, levels and curves of recordings with one effect each."""
-    found = {}
-    effects = {'none': (), 'tone': (term('tone', amplitude=0.03, frequency=50.0, phase=0.4,
-                                         linewidth=0.0),),
-               'slow': (term('second_relaxation', alpha=4.0, sigma=0.1),),
-               'sag': (term('load_sag', linear=0.3, square=0.1),),
-               'noise': (term('measurement_noise', std=0.02),),
-               'sigma': (term('load_dependent_sigma', throttle=[0.0, 0.5, 1.0],
-                              log_factor=[0.0, 0.5, 0.8]),),
-               'jumps': (term('jumps', rate=5.0, mean=-0.1, std=0.05),),
-               'glitches': (term('glitches', probability=0.01, std=0.5),)}
-    for name, others in effects.items():
-        samples = samples_of(3000, *others, seed=91, uneven=name == 'slow')
-        ou = term('ou', **OU)
-        plain = fit_composite(samples, [ou], samples.train)
-        given = covariates_of(samples, plain)
-        values = statistics(plain.z, given)
-        part = {'plain': [plain.terms[0].values(), plain.se, plain.free, plain.score(samples)],
-                'statistics': values,
-                'first': statistics(plain.z, replace(given, throttle=None), lines=False)}
-        # The likelihood of a second relaxation is flat: versions of SciPy differ by 1e-3.
-        if others and others[0].ROLE is not Role.LAW and name != 'slow':
-            full = fit_composite(samples, [ou, *others], samples.train)
-            part['full'] = [[one.values() for one in full.terms], full.se, full.score(samples)]
-        if name in ('none', 'tone'):
-            bank = simulate_bank(given, 0.94, np.random.default_rng(1), 5)
-            part['bank'] = [bank.mean, bank.std, criticise(samples, plain, bank)]
-            bank = simulate_bank_of(samples, plain, np.random.default_rng(2), 3)
-            part['bank of'] = [bank.mean, bank.std]
-        e = Estimate(alpha=63.0, sigma=0.632, var_inf=3.2e-3, u0=5.0, noise_std=0.0, alpha_se=0.1,
-                     sigma_se=0.02, var_inf_se=0.1, status=Status.OK, rate=1000.0)
-        half = samples.n // 2
-        halves = [(samples.t[:half], samples.voltage[:half]),
-                  (samples.t[half:], samples.voltage[half:])]
-        part['levels'] = holm([examine_level(halves, e), examine_level(
-            halves[:1], replace(e, status=Status.NO_RELAXATION, alpha=math.nan))])
-        found[name] = table(part)
-    samples = samples_of(1500, seed=92)
-    push, error, power = np.zeros(1500), np.zeros(1500), np.ones(1500)
-    push[300], error[700], power[900:950] = 0.02, 0.01, 3.0
-    fit = fit_gaussian(samples, [term('ou', **OU), term('measurement_noise', std=0.01)],
-                       slice(0, 1200), Events(push, error, power, np.ones(1500)))
-    found['events'] = table([[one.values() for one in fit.terms], fit.z[::150],
-                             float(fit.density.sum())])
-    return found
-
-
-def discovery():
-    """Return measures of a correct model by `discover`: gains, errors, responses, crossings."""
-    found = {}
-    for name, others, uneven in (
-            ('sag', [term('load_sag', linear=0.3, square=0.1)], False),
-            ('transient', [term('load_transient', gain=-0.2, tau=0.03, delay=0.0),
-                           term('measurement_noise', std=0.01)], True),
-            ('tone', [term('tone', amplitude=0.02, frequency=50.0, phase=0.4, linewidth=0.0)],
-             False),
-            ('sigma', [term('load_dependent_sigma', throttle=[0.0, 0.5, 1.0],
-                            log_factor=[0.0, 0.5, 0.8])], False)):
-        samples = samples_of(3000, *others, seed=95, uneven=uneven)
-        ou = term('ou', **OU)
-        every = slice(0, samples.n)
-        plain = fit_composite(samples, [ou], every)
-        full = fit_composite(samples, [ou, *others], every)
-        less = without(samples, full, 1)
-        scores = [held_out(samples, one) for one in (plain, full, less)]
-        scored = covered(samples)
-        fitter = Fitter(samples)
-        bank = simulate_bank(covariates_of(samples, plain), 0.94, np.random.default_rng(1), 4)
-        kinds = kinds_to_try(catalogue().values(), [type(plain.terms[0])], (), True, True)
-        answer = mean_response(samples, plain, fitter.view(plain), load_terms(samples))
-        found[name] = table({
-            'errors': standard_errors(samples, full, every),
-            'less': [one.values() for one in less.terms], 'guess': guess(samples).values(),
-            'density': [[float(one.density.sum()), int(one.known.sum())] for one in scores],
-            'covered': int(scored.sum()),
-            'gains': [gain_of(scores[1], scores[0], scored),
-                      cause_gain(scores[1], scores[2], scored)],
-            'dips': low_dips(samples, np.zeros(samples.n), plain.terms, full.terms,
-                             np.random.default_rng(2)),
-            'load': [[one.NAME, one.values()] for one in load_terms(samples)],
-            'answer': [[one.NAME for one in answer.terms], answer.worth, answer.rivals],
-            'trials': [[one.name, float(one.evidence)] for one in fitter.trials(
-                plain, kinds, lambda model: criticise(samples, model, bank))][:4]})
-    return found
-
-
-RUNS = {run.__name__: run for run in (
-    terms, laws, integrity, criticism, discovery)}
+RUNS = {run.__name__: run for run in (terms, laws, integrity)}

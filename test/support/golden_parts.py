@@ -6,7 +6,6 @@ from golden_runs import table
 import numpy as np
 from ou_monitor import AdaptiveLowPass
 from ou_monitor.criticism.composite import Composite
-from ou_monitor.criticism.samples import choose_samples, events_between, lines_between
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.fitting import from_spectrum
 from ou_monitor.model.terms.catalogue import catalogue
@@ -15,7 +14,6 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import patience, StampWatch
 from ou_monitor.records import MOST_STAMP
 from ou_monitor.timeline import MOST_THROTTLE, MOST_VOLTAGE, plausible
-from scipy.signal import lfilter
 from term_examples import EXAMPLES, OU, term
 
 
@@ -117,31 +115,6 @@ def chains():
     return found
 
 
-def long():
-    """Return the samples used of long recordings, with events next to them and lines above."""
-    rng = np.random.default_rng(141)
-    n = 260_000
-    t = np.arange(n) * 1e-3
-    found = {}
-    for name, alpha in (('slow', 2.0), ('usual', 63.0), ('fast', 900.0), ('white', 1e9)):
-        keep = np.exp(-alpha * 1e-3)
-        v = 5.0 + lfilter([0.05 * np.sqrt(1.0 - keep * keep)], [1.0, -keep],
-                          rng.standard_normal(n))
-        v += 0.01 * np.sin(2.0 * np.pi * 411.0 * t)
-        for at in (5_001, 77_778, 130_003, 200_001):
-            v[at:] += 0.4 * (1.0 if at % 2 else -1.0)
-        which, _ = choose_samples(v, 1000.0)
-        u = np.zeros(n)
-        u[77_000:] = 0.5
-        thin = slice(0, n, 5)
-        found[name] = table([
-            [which.start, which.stop, which.step], events_between(v, None, 1000.0, thin),
-            events_between(v, u, 1000.0, thin),
-            [tone.values() for tone in lines_between(t, v, thin)],
-            [tone.values() for tone in lines_between(t + 1e-4 * (t > 99.0), v, thin)]])
-    return found
-
-
 def latent():
     """Return starts of fits with one more state, and laws with levels or three states."""
     found = {}
@@ -174,4 +147,4 @@ def latent():
     return found
 
 
-RUNS = {run.__name__: run for run in (flags, stamps, chains, long, latent)}
+RUNS = {run.__name__: run for run in (flags, stamps, chains, latent)}

@@ -3,10 +3,13 @@
 import math
 
 import numpy as np
+from numpy.testing import assert_allclose
 from ou_monitor import Recording
 from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.innovations import innovations, steps_before
 from ou_monitor.criticism.integrity import examine
-from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.samples import (
+    choose_samples, MOST, Samples)
 from ou_monitor.discovery.gain import guess
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Quantization
@@ -14,6 +17,7 @@ from ou_monitor.model.terms.shocks import Volatility
 import pytest
 from scipy.signal import lfilter
 from scipy.special import ndtr
+
 
 STEP, N = 0.005, 1500
 T = np.arange(N) / 100.0
@@ -66,3 +70,41 @@ def test_ties_pay_for_no_wandering_intensity():
         gains.append(float((law.density - plain.density).sum()))
     assert gains[0] > 300.0 > 30.0 > gains[1]
     assert isinstance(plain.terms[0], OU)
+
+
+def rail(n, keep, seed):
+    """Return a sampled OU of variance 1."""
+    noise = np.random.default_rng(seed).standard_normal(n)
+    return lfilter([math.sqrt(1.0 - keep * keep)], [1.0, -keep], noise)
+
+
+@pytest.mark.parametrize('code', (0.0, 3.0))
+def test_coarse_codes_do_not_hide_a_fast_relaxation(code):
+    """A relaxation of 16 samples among 8e5, of which every 10th would be too few."""
+    # Codes of three standard deviations: most differences are 0, and so is the smaller half.
+    v = rail(8 * MOST + 80_000, math.exp(-1.0 / 16.0), 1)
+    if code:
+        v = code * np.rint(v / code)
+    which, note = choose_samples(v, 1e3)
+    assert 'middle' in note and which.step <= 8
+    assert (which.start + which.stop) / 2 == pytest.approx(v.size / 2, abs=1.0)
+    assert which.stop - which.start == MOST * which.step
+
+
+def test_steps_a_little_off_count_as_the_usual_one():
+    t = np.cumsum([5.0, 1.0, 1.29, 0.71, 1.31, 0.69, 1.0, 1.0])
+    assert_allclose(steps_before(t), [np.inf, 1.0, 1.0, 1.0, 1.31, 0.69, 1.0, 1.0])
+
+
+def test_innovations_are_those_of_the_joint_normal_law():
+    """Cholesky of the covariance of an OU in white noise; of white noise alone, its scores."""
+    rng = np.random.default_rng(3)
+    # Steps that differ by more than 30 % and so are not taken for alike.
+    t = np.cumsum(rng.choice([0.1, 0.2, 0.5], 40))
+    deviation = rng.standard_normal(40)
+    covariance = 2.0 * np.exp(-1.3 * np.abs(t[:, None] - t)) + 0.5 * np.eye(40)
+    assert_allclose(innovations(t, deviation, 1.3, 2.0, 0.5),
+                    np.linalg.solve(np.linalg.cholesky(covariance), deviation), atol=1e-6)
+    assert_allclose(innovations(t, deviation, math.inf, 2.0, 0.5), deviation / math.sqrt(2.5))
+    assert_allclose(innovations(t[:1], deviation[:1], 1.3, 2.0, 0.5),
+                    deviation[:1] / math.sqrt(2.5))
