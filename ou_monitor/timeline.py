@@ -71,19 +71,8 @@ class Batch:
     # Stamps, s, strictly increasing; voltage, V; throttle and current, A, NaN where unknown;
     # shape (4, n), n > 0.
     columns: FloatArray
-    shortest: float  # shortest step, s, including the step from the sample before the batch
-    longest: float  # longest step, s, likewise
     restart: bool  # a new time line starts here: forget all earlier samples
     again: bool = False  # samples already passed on, now without their repeats
-
-    @classmethod
-    def of(cls, columns: FloatArray, restart: bool, *, again: bool = False,
-           before: float = -math.inf) -> Batch:
-        """Return a batch of columns (before: last stamp before them, s)."""
-        steps = np.diff(columns[0], prepend=before)
-        # There is no pause before the very first sample.
-        rest = steps if steps[0] < math.inf or steps.size == 1 else steps[1:]
-        return cls(columns, float(steps.min()), float(rest.max()), restart, again)
 
     @property
     def t(self) -> FloatArray:
@@ -202,7 +191,6 @@ class Repeats:
         self._waiting = np.empty((4, 0))
         self._value = math.nan
         self._place = 0
-        self._last = -math.inf
 
     def drop(self, batch: Batch) -> Batch | None:
         """Return the new readings among samples; None if there are none."""
@@ -210,8 +198,7 @@ class Repeats:
         columns = columns[:, self.fresh(columns)]
         if not columns.size:
             return None
-        before, self._last = self._last, float(columns[0, -1])
-        return Batch.of(columns, batch.restart, again=batch.again, before=before)
+        return replace(batch, columns=columns)
 
     def fresh(self, columns: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which samples are new readings; undecided samples wait for the next call."""
@@ -603,8 +590,8 @@ class TimeLine:
         self.count(late=t.size - columns.shape[1], used=columns.shape[1])
         if not columns.size:
             return None
-        before, self.newest = self.newest, float(columns[0, -1])
-        return Batch.of(columns, restart, before=before)
+        self.newest = float(columns[0, -1])
+        return Batch(columns, restart)
 
     def _readings(self, batch: Batch) -> list[Batch]:
         """Drop repeats; when they are first recognised, pass on the tail again without them."""
@@ -627,7 +614,7 @@ class TimeLine:
         again = before == 1.0
         if again:
             self._repeats.forget()
-            batch = Batch.of(whole, batch.restart, again=True)
+            batch = Batch(whole, batch.restart, again=True)
         kept = self._repeats.drop(batch)
         dropped = batch.t.size - (0 if kept is None else kept.t.size)
         self.count(held=dropped, used=-dropped)

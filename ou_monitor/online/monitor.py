@@ -197,8 +197,8 @@ class SupplyMonitor:
         t, level = float(batch.t[-1]), self._level
         if math.isnan(level) and batch.t.size > 3 and not batch.again:
             # The first readings show whether the supply is on.
-            self._take(Batch.of(batch.columns[:, :3], batch.restart), came)
-            self._take(Batch.of(batch.columns[:, 3:], False, before=float(batch.t[2])), came)
+            self._take(Batch(batch.columns[:, :3], batch.restart), came)
+            self._take(Batch(batch.columns[:, 3:], False), came)
             return
         before = level
         if level >= _POWERED:
@@ -209,14 +209,14 @@ class SupplyMonitor:
                 self._forecast.see(batch.y[~on])
                 if not on.any():
                     return
-                batch = Batch.of(batch.columns[:, on], batch.restart, again=batch.again)
+                batch = Batch(batch.columns[:, on], batch.restart, batch.again)
             level *= math.exp(-max(t - self._on_at, 0.0) / _ANOTHER)
         self._pass_on(batch, came)
         now = self._forecast.voltage
         on = batch.y >= OFF * now
         if now >= _POWERED and before < OFF * now and on.any():
             self._begin(self._line)
-            self._pass_on(Batch.of(batch.columns[:, on], True), came)
+            self._pass_on(Batch(batch.columns[:, on], True), came)
         self._level, self._on_at = level if level > now else now, t
 
     def _pass_on(self, batch: Batch, came: float) -> None:

@@ -430,13 +430,11 @@ class BlockAverager:
         t = batch.t
         columns = batch.columns[:3]
         restart = False
-        even = self._is_even(batch.shortest) and self._is_even(batch.longest)
-        if not even:
-            restart = self._learn(np.concatenate([self._stamps, t]))
-        if t.size >= MEMORY:
-            self._stamps = t[-MEMORY:].copy()
-        else:
-            self._stamps = np.concatenate([self._stamps, t])[-MEMORY:]
+        stamps = np.concatenate([self._stamps, t])
+        steps = np.diff(stamps[-t.size - 1:])
+        if not (steps.size and np.abs(steps - self.step).max() <= UNEVEN * self.step):
+            restart = self._learn(stamps)
+        self._stamps = stamps[-MEMORY:].copy()
         columns = np.concatenate([self._rest, columns], axis=1)
         if self.m == 0:
             self._rest = columns
@@ -445,9 +443,6 @@ class BlockAverager:
             return self._blocks(columns), restart
         self._rest = columns[:, :0]
         return columns, restart
-
-    def _is_even(self, step: float) -> bool:
-        return abs(step - self.step) <= UNEVEN * self.step
 
     def _learn(self, stamps: FloatArray) -> bool:
         """Update the usual step; return whether the block size changed."""

@@ -26,7 +26,7 @@ LOOK = round(1.0 * RATE)
 
 
 def batch(t, v):
-    return Batch.of(np.stack((t, v, *np.full((2, t.size), math.nan))), restart=False)
+    return Batch(np.stack((t, v, *np.full((2, t.size), math.nan))), restart=False)
 
 
 def telegraph(rng, n):
