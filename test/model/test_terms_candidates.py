@@ -9,8 +9,7 @@ from ou_monitor.model.hidden_chain import forward, log_likelihood
 from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.load_response import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
-    chain_of, rates_between, RegimeSwitching, relaxing, Scores, stationary_law, step_chances,
-    without_levels)
+    chain_of, rates_between, RegimeSwitching, relaxing, Scores, stationary_law, step_chances)
 from ou_monitor.model.terms.shocks import _best_runs, _mixture, Jumps
 from ou_monitor.model.terms.term import curvature_se, normal_scores, refine, View
 from ou_monitor.model.terms.tones import order_power
@@ -339,13 +338,3 @@ def test_without_white_noise_nothing_is_behind():
     view = filtered(drawn(0.4, 1.0, 4)[0], 1e3 * WHITE)
     x = np.array([0.0, 0.0, 4.0, 0.0, 0.0])
     assert not Scores.of(view).following(x, 1.0).followed.any()
-
-
-def test_the_ou_without_levels_is_fitted_again():
-    voltage, levels = drawn(0.4, 1.0, 5)
-    view = filtered(voltage, 5.0 * DRIVE)
-    again = without_levels(view, levels)
-    # The OU and the noise that are there: one-step variance within a fifth.
-    true = filtered(voltage, DRIVE)
-    assert again.variance[0] == pytest.approx(true.variance[0], rel=0.2)
-    assert float(again.trust) == pytest.approx(true.trust[0], rel=0.4)

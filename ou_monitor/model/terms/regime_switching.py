@@ -30,8 +30,6 @@ _MEDIAN = 0.6745
 # Filter gain that counts as 1; level, in standard deviations of an innovation, below which it
 # counts as 0.
 _ALL, NO_LEVEL = 0.98, 0.2
-# Minimum correlation of adjacent residuals to fit an OU to the voltage without levels.
-_LEAST = 1e-3
 
 
 def rates_between(up: float, down: float, states: int) -> FloatArray:
@@ -199,49 +197,6 @@ class Start:
     x: FloatArray  # Two ln rates, level in std of an innovation, ln sigma ratio, ln scale
     at_once: float
     view: View
-    to_refine: bool  # Whether to fit again after `without_levels`
-
-
-def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
-    """Return the view of a steady-state filter (keep: phi of the median step; variance, V^2)."""
-    phi = view.phi**(math.log(keep) / math.log(float(np.median(view.phi[view.train]))))
-    before = np.concatenate(([0.0], view.residual[:-1]))
-    e = view.residual - first_order(phi * (1.0 - trust), phi * trust * before, 0.0)
-    e -= float(np.median(e[view.train]))
-    variances = variance * view.variance / float(np.median(view.variance))
-    return replace(view, z=e / np.sqrt(variances), phi=phi, variance=variances, trust=trust)
-
-
-def without_levels(view: View, levels: FloatArray) -> View:
-    """Return the view for an OU that is fitted to the voltage without the levels, V."""
-    # White noise is added to the OU if that predicts the voltage without levels better; the
-    # parameters come from covariances at lags up to 2.
-    r = (view.residual - levels)[view.train]
-    r = r - r.mean()
-    near, next_, far = (float(r[k:] @ r[:r.size - k]) / r.size for k in range(3))
-    if not near > 0.0 or not next_ > _LEAST * near:
-        return view
-    usual = float(np.median(view.phi[view.train]))
-    best: tuple[float, float, float] | None = None
-    for keep, power in ((next_ / near, near), (far / next_, next_**2 / max(far, _LEAST * near))):
-        keep, power = min(max(keep, _LEAST), usual), min(power, near)
-        ahead, white = _settled_variances(keep, power, near - power)
-        trust = ahead / (ahead + white)
-        e = r[1:] - first_order(np.full(r.size - 1, keep * (1.0 - trust)),
-                                keep * trust * r[:-1], 0.0)
-        variance = float(np.mean(e * e))
-        if best is None or variance < best[0]:
-            best = variance, keep, trust
-    assert best is not None
-    variance, keep, trust = best
-    return _filtered(view, keep, trust, variance)
-
-
-def _settled_variances(keep: float, power: float, white: float) -> tuple[float, float]:
-    """Return the steady-state predictive variance of the OU, and the white noise's variance."""
-    drive = power * (1.0 - keep * keep)
-    b = white * (1.0 - keep * keep) - drive
-    return 0.5 * (-b + math.sqrt(b * b + 4.0 * drive * white)), white
 
 
 def _dwells(view: View) -> FloatArray:
@@ -288,16 +243,8 @@ def _first_fits(view: View) -> list[Start]:
                 rate = -math.log(dwell)
                 x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
                 if (level != 0.0) not in best or top > best[level != 0.0][0]:
-                    best[level != 0.0] = top, Start(x, once, relaxed, level != 0.0)
+                    best[level != 0.0] = top, Start(x, once, relaxed)
     return [start for _, start in best.values()]
-
-
-def _fit_again(fit: LawFit, start: Start, view: View) -> Start:
-    """Return a start at the rates and level of a fit, for a view with another OU."""
-    term, unit = fit.term, math.sqrt(float(np.median(view.variance)))
-    assert isinstance(term, RegimeSwitching)
-    return Start(np.array([math.log(term.rate_up), math.log(term.rate_down), term.level / unit,
-                           0.0, 0.0]), start.at_once, view, False)
 
 
 # Maximum number of events in one segment; limits time and memory.
@@ -416,16 +363,11 @@ class RegimeSwitching(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a hidden chain of two or three states."""
-        starts = _first_fits(view)
         best: tuple[LawFit, Start] | None = None
-        while starts:
-            start = starts.pop()
+        for start in _first_fits(view):
             fit = cls._best_fit(start.view, [start.x], start.at_once, 80)
             if fit is None:
                 continue
-            if start.to_refine and fit.offset is not None:
-                # Fit the OU again to the voltage without the levels.
-                starts.append(_fit_again(fit, start, without_levels(view, fit.offset)))
             if start.view is not view:
                 fit = replace(fit, gain=fit.gain + log_normal(start.view.z)
                               - _densities(view, start.view))
