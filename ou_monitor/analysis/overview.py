@@ -137,10 +137,9 @@ def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
         return None
     line, level = max(found, key=lambda pair: pair[0].rms)
     lines = level.lines.lines
-    comb = comb_of([each.frequency for each in lines])
     return LoudestLine(line.frequency, line.rms, line.share, level.label, len(lines),
                        min(1.0, sum(each.share for each in lines)),
-                       comb.fundamental if comb else NAN)
+                       comb_of([each.frequency for each in lines])[0])
 
 
 def answers(found: Overview) -> list[str]:

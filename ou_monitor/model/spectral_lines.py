@@ -71,18 +71,11 @@ class Line:
 _NEAR_MULTIPLE, _UNRELATED = 0.01, 1e-3
 
 
-@dataclass(frozen=True)
-class Comb:
-    """Lines at multiples of one frequency."""
-
-    fundamental: float  # Hz
-    harmonics: tuple[int, ...]  # Multiple at which each line lies; 0: not in the comb
-
-
-def comb_of(frequencies: Sequence[float]) -> Comb | None:
-    """Return the comb that contains most of the lines (Hz); None if chance can explain it."""
+def comb_of(frequencies: Sequence[float]) -> tuple[float, tuple[int, ...]]:
+    """Return the fundamental of most of the lines (Hz), and the multiple (or 0) of each line."""
+    # The fundamental is NaN, and all multiples are 0, if chance can explain every comb.
     f = np.asarray(frequencies, dtype=np.float64)
-    best: tuple[int, float, npt.NDArray[np.intp]] | None = None
+    most, fundamental, multiples = 2, NAN, np.zeros(f.size, np.intp)
     for trial in np.unique(np.outer(f, (1.0, 0.5, 1.0 / 3.0)))[::-1].tolist():
         order = np.rint(f / trial).astype(np.intp)
         near = (order > 0) & (np.abs(f / trial - order) < _NEAR_MULTIPLE)
@@ -90,10 +83,10 @@ def comb_of(frequencies: Sequence[float]) -> Comb | None:
         chance = sum(math.comb(f.size, k) * (2.0 * _NEAR_MULTIPLE)**k
                      * (1.0 - 2.0 * _NEAR_MULTIPLE)**(f.size - k)
                      for k in range(count - 1, f.size + 1))
-        if count > max(2, best[0] if best else 0) and 3.0 * f.size * chance < _UNRELATED:
+        if count > most and 3.0 * f.size * chance < _UNRELATED:
+            most, multiples = count, np.where(near, order, 0)
             fundamental = float(f[near] @ order[near] / (order[near] @ order[near]))
-            best = count, fundamental, np.where(near, order, 0)
-    return best and Comb(best[1], tuple(best[2].tolist()))
+    return fundamental, tuple(multiples.tolist())
 
 
 @dataclass(frozen=True)

@@ -176,9 +176,8 @@ def test_harmonics_have_their_fundamental_and_unrelated_lines_none(count):
     rng = np.random.default_rng(count)
     orders = np.arange(1, count + 1)
     found = comb_of([*(106.5 * orders * rng.normal(1.0, 1e-4, count)), 78.1])
-    assert found.fundamental == pytest.approx(106.5, rel=1e-3)
-    assert found.harmonics == (*orders, 0)
-    false = sum(comb_of(rng.uniform(5.0, 500.0, count)) is not None for _ in range(1000))
+    assert found[0] == pytest.approx(106.5, rel=1e-3) and found[1] == (*orders, 0)
+    false = sum(comb_of(rng.uniform(5.0, 500.0, count)) [0] > 0.0 for _ in range(1000))
     assert false <= 5
 
 
