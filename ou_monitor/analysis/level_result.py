@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
-from ou_monitor.analysis.levels import LevelSegment, LoadLevel
+from ou_monitor.analysis.levels import LoadLevel
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, sampled_spectrum
@@ -215,7 +215,7 @@ class LevelSpectrum:
     fitted: FloatArray = field(default_factory=_empty)
 
 
-def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
+def level_spectrum(recording: Recording, segments: Sequence[slice],
                    estimate: Estimate) -> LevelSpectrum:
     """Return the PSD of a level (Welch, Hann), averaged over its segments."""
     # Samples are treated as evenly spaced; if they are not, the PSD is smeared near the Nyquist
@@ -231,7 +231,7 @@ def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
     for s in segments:
         n = s.stop - s.start
         if n >= length:
-            frequency, density = welch(recording.voltage[s.start:s.stop], fs=rate,
+            frequency, density = welch(recording.voltage[s], fs=rate,
                                        nperseg=length, detrend='constant')
             summed, weight = summed + n * density, weight + n
     # Leave out the first two bins, which the removal of the mean distorts, and the last, at the
@@ -243,14 +243,14 @@ def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
     return LevelSpectrum(frequency, density, fitted)
 
 
-def segment_rate(recording: Recording, segments: Sequence[LevelSegment]) -> float:
+def segment_rate(recording: Recording, segments: Sequence[slice]) -> float:
     """Return the mean rate of the samples within segments, Hz; 0 if they have no duration."""
     steps = sum(s.stop - s.start - 1 for s in segments)
     time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
     return steps / time if time > 0.0 else 0.0
 
 
-def _pieces(segments: Sequence[LevelSegment], length: int) -> int:
+def _pieces(segments: Sequence[slice], length: int) -> int:
     """Return the number of half-overlapping pieces of a length in the segments."""
     return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in segments)
 
@@ -287,16 +287,16 @@ def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
     return of_ou + noise * noise / max(n, 1)
 
 
-def fit_parts(recording: Recording, left: Remainder, segments: Sequence[LevelSegment],
+def fit_parts(recording: Recording, left: Remainder, segments: Sequence[slice],
               throttle: float = NAN) -> tuple[OuFacts, Estimate]:
     """Fit segments of a recording, and return the fit as facts and as the node's record."""
     n = sum(s.stop - s.start for s in segments)
     if not n:
         return OuFacts('no_data'), Estimate(throttle=throttle, status=Status.TOO_FEW_SAMPLES)
-    parts = [(left.voltage[s.start:s.stop], left.size[s.start:s.stop]) for s in segments]
+    parts = [(left.voltage[s], left.size[s]) for s in segments]
     ou = fit_pieces(parts, left.dt, left.walk, left.absorbed)
     time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
-    mean = sum(float(recording.voltage[s.start:s.stop].sum()) for s in segments) / n
+    mean = sum(float(recording.voltage[s].sum()) for s in segments) / n
     looked = examine(recording.voltage[segments[-1].start:segments[-1].stop][-TAIL:])
     blank = Estimate(
         t=float(recording.t[segments[-1].stop - 1]), u0=mean, throttle=throttle,
@@ -323,7 +323,7 @@ class LevelResult:
     """Results of one load level."""
 
     throttle: float  # 0..1; NaN if the level is the whole recording
-    segments: tuple[LevelSegment, ...]  # Segments used
+    segments: tuple[slice, ...]  # Segments used
     time: float  # Time in them, s
     n: int  # Samples in them
     mean: float  # Mean voltage, V
@@ -395,16 +395,16 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
     within = [part for s in segments for part in _known_parts(s, left.voltage)]
     ou, estimate = fit_parts(recording, left, within, level.throttle)
     still = replace(recording, voltage=left.voltage)
-    grids = [on_grid(still.t[s.start:s.stop], still.voltage[s.start:s.stop]) for s in within]
+    grids = [on_grid(still.t[s], still.voltage[s]) for s in within]
     even = _grid_rate(grids)
     # Without whitening, the steep spectrum of a slow relaxation would show false lines.
     model = estimate if estimate.usable or whole is None else whole()
     lines = find_lines([grid.values for grid in grids], even, levels=levels, white=[
-        _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], model)
+        _white(still.t[s], still.voltage[s], model)
         for s in within] if model.usable else ())
     if lines.lines and math.isfinite(level.throttle):
         # A line that is also in the throttle belongs to the load.
-        commanded = find_lines([on_grid(still.t[s.start:s.stop], still.throttle[s.start:s.stop]
+        commanded = find_lines([on_grid(still.t[s], still.throttle[s]
                                         ).values for s in within], even).lines
         lines = replace(lines, lines=tuple(line for line in lines.lines if not any(
             abs(line.frequency - other.frequency) < line.resolution + other.resolution
@@ -415,10 +415,10 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
     if lines.lines and not kept:
         clean = still.voltage.copy()
         for s, grid in zip(within, grids):
-            clean[s.start:s.stop] = without_lines(grid.values, even, lines.lines)[grid.where]
+            clean[s] = without_lines(grid.values, even, lines.lines)[grid.where]
         ou, estimate = fit_parts(recording, replace(left, voltage=clean), within, level.throttle)
         shape = examine_level(_parts(replace(still, voltage=clean), within), estimate, left.above)
-    parts = [recording.voltage[s.start:s.stop] for s in segments]
+    parts = [recording.voltage[s] for s in segments]
     deviation = np.concatenate([v - v.mean() for v in parts])
     return LevelResult(
         throttle=level.throttle, segments=tuple(segments),
@@ -436,17 +436,17 @@ def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) 
                                        for part in _known_parts(s, left.voltage)])[1]
 
 
-def _known_parts(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
+def _known_parts(segment: slice, voltage: FloatArray) -> list[slice]:
     """Return the parts of a segment in which the voltage is not NaN (near gaps, it is NaN)."""
-    known = np.isfinite(voltage[segment.start:segment.stop])
+    known = np.isfinite(voltage[segment])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start
-    return [LevelSegment(a, b)
+    return [slice(a, b)
             for a, b in zip(turns[::2].tolist(), turns[1::2].tolist()) if b - a > 1]
 
 
-def _parts(recording: Recording, segments: Sequence[LevelSegment]
+def _parts(recording: Recording, segments: Sequence[slice]
            ) -> list[tuple[FloatArray, FloatArray]]:
-    return [(recording.t[s.start:s.stop], recording.voltage[s.start:s.stop]) for s in segments]
+    return [(recording.t[s], recording.voltage[s]) for s in segments]
 
 
 def _white(t: FloatArray, voltage: FloatArray, estimate: Estimate) -> FloatArray:

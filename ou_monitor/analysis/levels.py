@@ -53,19 +53,11 @@ _VALLEY = 0.7
 
 
 @dataclass(frozen=True)
-class LevelSegment:
-    """A segment of samples: indices ``start <= k < stop`` of the recording."""
-
-    start: int
-    stop: int
-
-
-@dataclass(frozen=True)
 class LoadLevel:
     """A throttle, and the segments of the recording in which it was held."""
 
     throttle: float  # Throttle of the level, 0..1; NaN if it is the whole recording
-    segments: tuple[LevelSegment, ...]  # Segments at this throttle, without settling
+    segments: tuple[slice, ...]  # Segments at this throttle, without settling
     settling: float = 0.0  # Time left out after changes of throttle, s
 
 
@@ -77,7 +69,7 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     width = half_width(t, throttle)
     if given is not None:
         return _split(t, throttle, _checked(given), width, True)
-    whole = (LoadLevel(NAN, tuple(_split_at_pauses(LevelSegment(0, t.size), _gaps(t)))),)
+    whole = (LoadLevel(NAN, tuple(_split_at_pauses(slice(0, t.size), _gaps(t)))),)
     centres = _modes(t, throttle, width)
     while centres:
         found = _split(t, throttle, centres, width, False)
@@ -129,7 +121,7 @@ def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: flo
            named: bool) -> tuple[LoadLevel, ...]:
     """Return levels with their segments; levels given by the user (`named`) keep passages."""
     broken = _gaps(t)
-    runs: list[list[LevelSegment]] = [[] for _ in centres]
+    runs: list[list[slice]] = [[] for _ in centres]
     for run, k in level_segments(throttle, centres, width):
         runs[k] += _split_at_pauses(run, broken)
     found = []
@@ -140,7 +132,7 @@ def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: flo
         kept, lost = _drop_settling(t, mine, away, broken)
         mean = centre
         if not named and kept:
-            mean = float(np.median(np.concatenate([throttle[s.start:s.stop] for s in kept])))
+            mean = float(np.median(np.concatenate([throttle[s] for s in kept])))
         found.append(LoadLevel(mean, kept, lost))
     return tuple(found)
 
@@ -207,7 +199,7 @@ def _are_separate(density: FloatArray, peak: int, other: int, reach: int) -> boo
 
 
 def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
-                   ) -> list[tuple[LevelSegment, int]]:
+                   ) -> list[tuple[slice, int]]:
     """Return the segments of constant throttle, each with the index of its level."""
     if not centres:
         return []
@@ -224,19 +216,19 @@ def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
     at = np.where((away <= inner).any(axis=1), away.argmin(axis=1), -1).tolist()
     near = (away <= outer).tolist()
     starts = np.flatnonzero(np.diff(zone, prepend=-1))
-    found: list[tuple[LevelSegment, int]] = []
+    found: list[tuple[slice, int]] = []
     here, begin, last = -1, 0, 0
     for start, stop, where in zip(starts.tolist(), [*starts[1:].tolist(), throttle.size],
                                   zone[starts].tolist()):
         if here >= 0 and not near[where][here]:
-            found.append((LevelSegment(begin, last), here))
+            found.append((slice(begin, last), here))
             here = -1
         if here < 0 and at[where] >= 0:
             here, begin = at[where], start
         if here >= 0 and at[where] == here:
             last = stop
     if here >= 0:
-        found.append((LevelSegment(begin, last), here))
+        found.append((slice(begin, last), here))
     return found
 
 
@@ -251,23 +243,23 @@ def _half_widths(centres: Sequence[float], width: float) -> FloatArray:
     return np.minimum(width, 0.5 * _distance_to_nearest(centres)) + 1e-9
 
 
-def _split_at_pauses(run: LevelSegment, broken: BoolArray) -> list[LevelSegment]:
+def _split_at_pauses(run: slice, broken: BoolArray) -> list[slice]:
     cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
     ends = [run.start, *cuts.tolist(), run.stop]
-    return [LevelSegment(a, b) for a, b in zip(ends, ends[1:])]
+    return [slice(a, b) for a, b in zip(ends, ends[1:])]
 
 
-def _passage(t: FloatArray, throttle: FloatArray, run: LevelSegment, width: float) -> bool:
+def _passage(t: FloatArray, throttle: FloatArray, run: slice, width: float) -> bool:
     if t[run.stop - 1] - t[run.start] >= _PASSAGE:
         return False
-    inside = throttle[run.start:run.stop]
+    inside = throttle[run]
     quarter = max(1, inside.size // 4)
     moved = abs(float(inside[-quarter:].mean()) - float(inside[:quarter].mean()))
     return moved > max(_CROSSED * width, _STEADY * float(np.ptp(inside)))
 
 
-def _drop_settling(t: FloatArray, runs: Sequence[LevelSegment], away: BoolArray,
-                   broken: BoolArray) -> tuple[tuple[LevelSegment, ...], float]:
+def _drop_settling(t: FloatArray, runs: Sequence[slice], away: BoolArray,
+                   broken: BoolArray) -> tuple[tuple[slice, ...], float]:
     """Leave out the settling time after changes of throttle larger than jitter."""
     kept, lost = [], 0.0
     for run in runs:
@@ -280,5 +272,5 @@ def _drop_settling(t: FloatArray, runs: Sequence[LevelSegment], away: BoolArray,
         start = min(max(start, run.start), run.stop)
         lost += float(t[min(start, run.stop - 1)] - t[run.start])
         if start < run.stop - 1:
-            kept.append(LevelSegment(start, run.stop))
+            kept.append(slice(start, run.stop))
     return tuple(kept), lost

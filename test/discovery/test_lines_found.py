@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor import discover
 from ou_monitor.analysis.level_result import fit_level
-from ou_monitor.analysis.levels import LevelSegment, LoadLevel
+from ou_monitor.analysis.levels import LoadLevel
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
@@ -91,7 +91,7 @@ def test_analyze_and_discover_name_the_same_lines_of_a_comb():
     whole = recorded(REAL / 'xt_pico_a.csv')
     n = 5_000
     part = replace(whole, t=whole.t[:n], voltage=whole.voltage[:n], throttle=np.full(n, NAN))
-    level = fit_level(part, bare(part), LoadLevel(NAN, (LevelSegment(0, n),)), 1)
+    level = fit_level(part, bare(part), LoadLevel(NAN, (slice(0, n),)), 1)
     tones = [cause for cause in discover(part).causes if cause.name == 'tone']
     ours = [(line.frequency, line.p_value < 1e-5) for line in level.lines.lines]
     theirs = [(one.term.frequency, one.term.amplitude > 7.0 * one.se['amplitude'])

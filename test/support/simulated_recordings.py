@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from ou_monitor.analysis.level_result import fit_level, fit_parts, LevelResult
 from ou_monitor.analysis.level_tests import holm
-from ou_monitor.analysis.levels import LevelSegment, LoadLevel
+from ou_monitor.analysis.levels import LoadLevel
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, NAN, Recording
@@ -37,11 +37,11 @@ def bare(simulated: Recording) -> Remainder:
 
 def as_one_level(simulated: Recording) -> LevelResult:
     """Return the result of `analyze` for a recording as one load level, ten times as fast."""
-    whole = LoadLevel(NAN, (LevelSegment(0, simulated.n),))
+    whole = LoadLevel(NAN, (slice(0, simulated.n),))
     level = fit_level(simulated, bare(simulated), whole, 1)
     return replace(level, shape=holm([level.shape])[0])
 
 
 def fitted(simulated: Recording, start: int, stop: int) -> Estimate:
     """Return the estimate of a level of these samples."""
-    return fit_parts(simulated, bare(simulated), [LevelSegment(start, stop)])[1]
+    return fit_parts(simulated, bare(simulated), [slice(start, stop)])[1]
