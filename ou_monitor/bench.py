@@ -476,7 +476,8 @@ _RECENT = 10.0
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
             risk: float) -> tuple[Flight, SupplyFacts, Callable[..., float] | None]:
     """Return flight, facts, and a function for the risk at the end (full and level in V)."""
-    from ou_monitor.analysis.supply import facts_and_end, node_for, remainder, without_wild
+    from ou_monitor.analysis.noise import remainder, without_wild
+    from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
     from ou_monitor.online.load.supply_load import Basis
     from ou_monitor.online.settings import MonitorSettings

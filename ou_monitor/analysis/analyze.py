@@ -23,10 +23,10 @@ from ou_monitor.analysis.level_result import (
     fit_all, fit_level, judge_levels, LevelResult, ProcessType)
 from ou_monitor.analysis.level_tests import alpha_constancy, AlphaTest, EFFECT, LEAST, LEVEL
 from ou_monitor.analysis.levels import find_levels, LoadLevel
+from ou_monitor.analysis.noise import flown_near, remainder, THROTTLES, without_wild
 from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import noise_items, quality_list, QualityItem
-from ou_monitor.analysis.supply import (
-    alarms, Dips, fed, flown_near, node_for, remainder, THROTTLES, without_wild)
+from ou_monitor.analysis.supply import alarms, Dips, fed, node_for
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator

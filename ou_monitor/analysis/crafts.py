@@ -15,7 +15,8 @@ import re
 from typing import Any
 
 import numpy as np
-from ou_monitor.analysis.supply import flown_near, SupplyFacts
+from ou_monitor.analysis.noise import flown_near
+from ou_monitor.analysis.supply import SupplyFacts
 from ou_monitor.errors import InputError
 from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import NAN, plain_data, Recording

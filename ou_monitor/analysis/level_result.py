@@ -2,7 +2,7 @@
 One load level of a recording -> its fit, tests, spectrum and lines.
 
 Level and load are subtracted from the whole recording first
-(`ou_monitor.analysis.supply.remainder`); the residual in the segments of the level, without
+(`ou_monitor.analysis.noise.remainder`); the residual in the segments of the level, without
 spectral lines, is fitted by the model that all commands share (`ou_monitor.model.ou_fit`).
 
 Limits: a relaxation slower than half a segment, or than 2.5 s, counts as drift of the level.
@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.analysis.levels import LoadLevel
-from ou_monitor.analysis.supply import Remainder
+from ou_monitor.analysis.noise import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, sampled_spectrum
 from ou_monitor.model.ou_fit import fit_pieces, white_variance

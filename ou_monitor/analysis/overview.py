@@ -14,9 +14,9 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult, ProcessType
+from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
 from ou_monitor.analysis.quality import beware
-from ou_monitor.analysis.supply import (
-    BAND, facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
+from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
 from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor

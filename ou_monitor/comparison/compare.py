@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.supply import dip_begins, noise_of, remainder, rise_that_ends
+from ou_monitor.analysis.noise import dip_begins, noise_of, remainder, rise_that_ends
 from ou_monitor.comparison.flight_model import FiledModel, fit_flight, FlightModel, MOVES, Readings
 from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray

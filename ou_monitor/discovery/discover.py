@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.supply import rise_at
+from ou_monitor.analysis.noise import rise_at
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples

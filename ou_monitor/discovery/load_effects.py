@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.supply import dip_begins
+from ou_monitor.analysis.noise import dip_begins
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import LoadFall, LowDips

@@ -12,9 +12,9 @@ from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line, LOWEST_CELL
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.level_tests import NARROW, sigma_change
+from ou_monitor.analysis.noise import BAND
 from ou_monitor.analysis.overview import answers, determined, known_lines
 from ou_monitor.analysis.quality import faults, QualityItem
-from ou_monitor.analysis.supply import BAND
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import DEFAULT_LIMIT

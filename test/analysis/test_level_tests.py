@@ -9,7 +9,7 @@ from ou_monitor.analysis.level_result import fit_all
 from ou_monitor.analysis.level_tests import (
     adjusted, alpha_constancy, examine_level, holm, Shape, sigma_change, SigmaChange, TestResult)
 from ou_monitor.analysis.levels import LoadLevel
-from ou_monitor.analysis.supply import remainder
+from ou_monitor.analysis.noise import remainder
 from ou_monitor.criticism.innovations import innovations
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 from ou_monitor import read_recording, Recording, supply_facts
 from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.noise import noise_of
 from ou_monitor.analysis.overview import answers, determined, known_lines, overview
-from ou_monitor.analysis.supply import alarms, node_for, noise_of
+from ou_monitor.analysis.supply import alarms, node_for
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_result import fit_all
 from ou_monitor.analysis.levels import find_levels
-from ou_monitor.analysis.supply import remainder
+from ou_monitor.analysis.noise import remainder
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.sinusoid import fit_sinusoid, tones
 from ou_monitor.model.spectral_lines import comb_of, find_lines, on_grid, tail, without_lines

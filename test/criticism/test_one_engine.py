@@ -11,7 +11,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_result import fit_all
 from ou_monitor.analysis.levels import find_levels
-from ou_monitor.analysis.supply import remainder
+from ou_monitor.analysis.noise import remainder
 from ou_monitor.criticism.composite import view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.analysis.supply import rise_at, supply_facts
+from ou_monitor.analysis.noise import rise_at
+from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.load_effects import dip_level, load_fall, low_dips
 from ou_monitor.model.supply import SupplyModel

@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor.analysis.level_result import fit_level, fit_parts, LevelResult
 from ou_monitor.analysis.level_tests import holm
 from ou_monitor.analysis.levels import LoadLevel
-from ou_monitor.analysis.supply import Remainder
+from ou_monitor.analysis.noise import Remainder
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, NAN, Recording
 
