@@ -17,7 +17,7 @@ from ou_monitor.analysis.level_result import LevelResult, ProcessType
 from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
 from ou_monitor.analysis.quality import beware
 from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
-from ou_monitor.model.spectral_lines import comb_of
+from ou_monitor.model.spectral_lines import fundamental_of
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
@@ -139,7 +139,7 @@ def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
     lines = level.lines.lines
     return LoudestLine(line.frequency, line.rms, line.share, level.label, len(lines),
                        min(1.0, sum(each.share for each in lines)),
-                       comb_of([each.frequency for each in lines])[0])
+                       fundamental_of([each.frequency for each in lines]))
 
 
 def answers(found: Overview) -> list[str]:

@@ -71,11 +71,10 @@ class Line:
 _NEAR_MULTIPLE, _UNRELATED = 0.01, 1e-3
 
 
-def comb_of(frequencies: Sequence[float]) -> tuple[float, tuple[int, ...]]:
-    """Return the fundamental of most of the lines (Hz), and the multiple (or 0) of each line."""
-    # The fundamental is NaN, and all multiples are 0, if chance can explain every comb.
+def fundamental_of(frequencies: Sequence[float]) -> float:
+    """Return the frequency of which most lines (Hz) are multiples; NaN if chance explains it."""
     f = np.asarray(frequencies, dtype=np.float64)
-    most, fundamental, multiples = 2, NAN, np.zeros(f.size, np.intp)
+    most, fundamental = 2, NAN
     for trial in np.unique(np.outer(f, (1.0, 0.5, 1.0 / 3.0)))[::-1].tolist():
         order = np.rint(f / trial).astype(np.intp)
         near = (order > 0) & (np.abs(f / trial - order) < _NEAR_MULTIPLE)
@@ -84,9 +83,9 @@ def comb_of(frequencies: Sequence[float]) -> tuple[float, tuple[int, ...]]:
                      * (1.0 - 2.0 * _NEAR_MULTIPLE)**(f.size - k)
                      for k in range(count - 1, f.size + 1))
         if count > most and 3.0 * f.size * chance < _UNRELATED:
-            most, multiples = count, np.where(near, order, 0)
+            most = count
             fundamental = float(f[near] @ order[near] / (order[near] @ order[near]))
-    return fundamental, tuple(multiples.tolist())
+    return fundamental
 
 
 @dataclass(frozen=True)
