@@ -65,14 +65,14 @@ LOADS, VOLTAGE = ('throttle', 'current'), 2
 def write_recording(
     rec: Recording | Iterable[Recording], path: str | Path, *,
     type: str = 'battery_state',  # noqa: A002
-    sample_rate: float = BLOCK_RATE,
+    start_ns: int = 0, sample_rate: float = BLOCK_RATE,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """
     Write topics `/voltage` and, if they are known, `/throttle` and `/current`.
 
-    rec: a recording or its pieces, of which only one is held in memory; sample_rate in Hz.
-    Returns the topics with their message types, and notes on changes.  If anything fails, the bag
-    is removed.
+    rec: a recording or its pieces, of which only one is held in memory; start_ns: added to the
+    stamps, ns; sample_rate in Hz.  Returns the topics with their message types, and notes on
+    changes.  If anything fails, the bag is removed.
     """
     if type not in TYPES:
         raise InputError(f"no bag type '{type}': {nearest(type, TYPES)}")
@@ -81,7 +81,7 @@ def write_recording(
         raise InputError(f'sample_rate must be above 0 Hz, got {sample_rate}')
     if isinstance(rec, Recording) and rec.n == 0:
         raise InputError(f"'{rec.name}' holds no sample: there is nothing to write")
-    kind, count, shift, first = TYPES[type], 0, 0, 0
+    kind, count, first = TYPES[type], 0, 0
     notes: tuple[str, ...] = ()
     # Samples of an incomplete block; value and period of each load's last message.
     rest: tuple[Stamps, FloatArray] = np.empty(0, np.int64), np.empty(0)
@@ -89,11 +89,11 @@ def write_recording(
     with BagWriter(path) as bag:
         bag.add_topic('voltage', kind, sample_rate=sample_rate if blocks else None)
         for piece in _pieces(rec):
-            stamps = as_nanoseconds(piece.t, piece.name)
+            stamps = as_nanoseconds(piece.t, piece.name) + start_ns
             if not count:
                 shift = max(0, -int(stamps[0]))
-                notes, first = _moved(shift), int(stamps[0]) + shift
-            stamps += shift
+                notes, start_ns, stamps = _moved(shift), start_ns + shift, stamps + shift
+                first = int(stamps[0])
             _check_header(kind, piece.name, stamps)
             volts = piece.voltage
             whole = stamps.size
