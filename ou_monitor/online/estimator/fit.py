@@ -116,8 +116,9 @@ _SETTLED = 1e-9
 # alpha and noise cannot be distinguished.
 _MOST_POINTS = 24
 # Steps, in ln a and z, for finite differences of slopes (error 1e-4 for unit curvature, rounding
-# 1e-7) and for finite differences of values.
+# 1e-7) and of values (error 1e-6, rounding 1e-5 in second derivatives); places of these values.
 _STEP, _HAIR = 1e-4, 1e-3
+_AROUND = np.array([[0.0, 1.0, -1.0, 0.0, 0.0, 1.0, -1.0], [0.0, 0.0, 0.0, 1.0, -1.0, 1.0, -1.0]])
 # Number of points of the initial grid of a search, in ln a and z.
 _GRID = (16, 8)
 # Minimum curvature in any direction, nats; maximum step.
@@ -132,9 +133,11 @@ _LOUDEST = math.log1p(1e4 / _SMALL)
 class _Point:
     """The likelihood at one choice of ln a (a = alpha step) and z (see `noise_scale`)."""
 
-    # Minus the restricted log-likelihood, nats, and its derivatives by ln a and z.
+    # Minus the restricted log-likelihood, nats, and its first and second derivatives by ln a and
+    # z (None: the second ones are unknown).
     value: float
     slopes: FloatArray
+    curved: FloatArray | None
     scale: float  # sigma^2, V^2/s
     # Products x' K^-1 z of all columns at scale 1: regressors, then the voltage.
     gram: FloatArray
@@ -172,9 +175,11 @@ class SpectralLikelihood:
     def at(self, log_a: float, z: float, used: int) -> _Point:
         """Return the likelihood with the first `used` regressors; see `StampLikelihood.at`."""
         value, scale, gram = self._cross.cost(self.step * _spectra(
-            self._cross.bins, self.m, log_a + _HAIR * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),
-            z + _HAIR * np.array([0.0, 0.0, 0.0, 1.0, -1.0])), used)
-        return _Point(float(value[0]), (value[1::2] - value[2::2]) / (2.0 * _HAIR),
+            self._cross.bins, self.m, log_a + _HAIR * _AROUND[0], z + _HAIR * _AROUND[1]), used)
+        both = value[1::2] + value[2::2] - 2.0 * value[0]
+        mixed = 0.5 * (both[2] - both[0] - both[1])
+        return _Point(float(value[0]), (value[1:5:2] - value[2:5:2]) / (2.0 * _HAIR),
+                      np.array([[both[0], mixed], [mixed, both[1]]]) / _HAIR ** 2,
                       float(scale[0]), gram[0])
 
     def start(self, used: int) -> FloatArray:
@@ -259,7 +264,7 @@ class StampLikelihood:
         value = 0.5 * (free * math.log(rest / free) + log_det + float(np.linalg.slogdet(own)[1])
                        + free * (1.0 + math.log(2.0 * math.pi)))
         slopes = np.array([by_rate, (_SMALL + share) * self.step * by_noise])
-        return _Point(value, slopes, rest / free, gram)
+        return _Point(value, slopes, None, rest / free, gram)
 
     def start(self, used: int) -> FloatArray:
         """Return ln a and z of a fit that treats the samples as evenly spaced."""
@@ -359,11 +364,13 @@ def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) 
 
 def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
                low: FloatArray, high: FloatArray) -> tuple[FloatArray, _Point, FloatArray | None]:
-    """Minimise f within a box (Newton, BFGS); return place, point, and curvature."""
+    """Minimise f within a box (Newton, or BFGS); return place, point, and curvature."""
     at = f(here)
     left = _MOST_POINTS
     while left > 0:
-        if curved is None:
+        if at.curved is not None:
+            curved = at.curved
+        elif curved is None:
             left -= 2
             curved = np.stack([(f(here + step).slopes - at.slopes) / _STEP
                                for step in _STEP * np.eye(2)])
