@@ -219,6 +219,13 @@ def test_a_written_recording_reads_back(tmp_path, type, start):  # noqa: A002
     assert back.notes == ()
 
 
+def test_start_is_added(tmp_path):
+    """Log times are exact in ns, whatever the epoch."""
+    write_recording(recording(100), tmp_path / 'bag', type='float32', start_ns=START)
+    messages = BagReader(tmp_path / 'bag').raw_messages(['/voltage'])
+    assert [m.log_time_ns for m in messages] == [START + 100_000 * k for k in range(100)]
+
+
 def test_throttle_is_sent_when_it_changes_and_once_a_second(tmp_path):
     t = np.arange(400) / 100.0
     throttle = np.where(t < 2.505, 0.25, 0.75)
