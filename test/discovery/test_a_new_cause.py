@@ -5,7 +5,6 @@ One that cannot be used, or that fails in a search, costs a note and no answer.
 """
 
 from contextlib import contextmanager
-from dataclasses import replace
 import json
 from pathlib import Path
 import shutil
@@ -18,16 +17,12 @@ import hidden_registry
 from hidden_registry import effect
 import numpy as np
 from ou_monitor import discover, Recording
-from ou_monitor.analysis.overview import overview
 from ou_monitor.cli.main import main
 from ou_monitor.cli.recorded import model_text
 from ou_monitor.model.supply import SupplyModel
 import ou_monitor.model.terms.catalogue as terms
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.recordings.model_file import read_model
-from ou_monitor.records import OuFacts
-from ou_monitor.report.discovery_document import discovery_document
-from ou_monitor.report.terminal import terminal
 from project import ROOT
 import pytest
 
@@ -113,16 +108,6 @@ def test_terminal_page_and_model_file_have_it(found, tmp_path):
     model = read_model(path).model
     assert model == SupplyModel(finding.model.terms)
     assert np.isfinite(model.simulate(np.arange(100) / 1e3, np.random.default_rng(0))).all()
-
-
-def test_the_fit_without_it_is_no_sign_of_a_changing_relaxation(found):
-    hidden, finding = found
-    seen = overview(Recording(hidden.t, hidden.voltage, hidden.throttle))
-    alpha = 0.1 * finding.model.ou.alpha
-    ou = OuFacts('ok', 60.0, alpha, (0.9 * alpha, 1.1 * alpha), 0.3, (0.2, 0.4), 0.01, (0.0, 0.1))
-    shown = ' '.join(terminal(discovery_document(
-        finding.record, replace(seen, facts=replace(seen.facts, ou=ou)))).split())
-    assert 'that value also contains heartbeat, which the model separates.' in shown
 
 
 def test_without_its_package_the_example_is_unknown():

@@ -10,8 +10,8 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import gain as gains
 from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, blocks_of, cause_gain, covered, gain_of, held_out, HeldOut, if_known,
-    mean_difference, mean_score, why_unknown, without)
+    BLOCKS, blocks_of, cause_gain, covered, held_out, HeldOut, if_known,
+    mean_difference, mean_score, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
@@ -142,19 +142,6 @@ def test_the_chance_of_a_cause_is_twice_the_smaller_of_two(gain, search):
     assert (found, error) == (mean, se)
     fitted = min(1.0, chi2.sf(max(0.0, 2.0 * (new - old).sum()), 2) * math.exp(search))
     assert chance == pytest.approx(min(1.0, 2.0 * min(fitted, norm.sf(mean / se))), rel=1e-9)
-
-
-def test_a_gain_needs_as_many_samples_as_blocks():
-    n = 100
-    new, old = np.full(n, 1.0), np.zeros(n)
-    for count, known in ((BLOCKS, True), (BLOCKS - 1, False)):
-        few = np.arange(n) < count
-        for which in range(3):
-            every = np.ones(n, bool)
-            masks = [few if k == which else every for k in range(3)]
-            a, b = held(new, known=masks[0]), held(old, known=masks[1])
-            assert math.isfinite(gain_of(a, b, masks[2])[0]) == known
-            assert (why_unknown(a, b, masks[2], False) == '') == known
 
 
 def test_a_cause_loses_no_more_than_without_further_states(monkeypatch):

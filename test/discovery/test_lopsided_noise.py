@@ -2,8 +2,6 @@
 
 import numpy as np
 from ou_monitor import discover
-from ou_monitor.criticism.composite import fit_composite
-from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.decision import kinds_to_try
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
@@ -11,7 +9,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise, Quantization
 from ou_monitor.records import Recording
 import pytest
-from scipy.stats import kstest, skew
+from scipy.stats import skew
 
 RAIL, STD = OU(1.0, 0.01, 12.0), 0.05
 N, RATE = 6000, 50.0
@@ -25,18 +23,6 @@ def test_its_mean_and_deviation_are_those_of_white_noise(shape, sign):
     assert v.mean() == pytest.approx(0.0, abs=4.0 * STD / 300.0)
     assert v.std() == pytest.approx(STD, rel=0.03)
     assert np.sign(np.round(skew(v), 0 if not sign else 2)) == sign
-
-
-def test_a_fit_finds_its_parameters_and_leaves_normal_scores():
-    terms = RAIL, MeasurementNoise(STD), LopsidedNoise(-0.4, 0.9)
-    samples = Samples(T, SupplyModel(terms).simulate(T, np.random.default_rng(2)), None)
-    found = fit_composite(samples, [RAIL, MeasurementNoise(STD), LopsidedNoise], slice(0, N))
-    law, errors = found.terms[-1], found.se[-1]
-    assert law.skew == pytest.approx(-0.4, abs=4.0 * errors['skew'])
-    assert law.tail == pytest.approx(0.9, abs=4.0 * errors['tail'])
-    assert max(errors.values()) < 0.1
-    assert kstest(found.z, 'norm').pvalue > 0.01
-    assert abs(float(np.corrcoef(found.z[1:], found.z[:-1])[0, 1])) < 4.0 / np.sqrt(N)
 
 
 def test_bursts_of_load_are_named_and_explain_the_recording():
