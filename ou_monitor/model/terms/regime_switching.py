@@ -112,19 +112,11 @@ class Scores:
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind
-            if states == 2:
-                # Unrolled, because a search spent half of its time here.
-                known = before[1] - middle
-                low, top = before
-                (a, b, c, d), (e, f) = off, scales
-                a, b, c, d = a + more, b + more, c + more, d + more
-                tops = [low * weights[0] * exp(e * a * a) + top * weights[2] * exp(e * c * c),
-                        low * weights[1] * exp(f * b * b) + top * weights[3] * exp(f * d * d)]
-            else:
-                known = sum(p * s for s, p in enumerate(before)) - middle
-                tops = [0.0] * states
-                for m, (i, j) in enumerate(pairs):
-                    tops[j] += before[i] * weights[m] * exp(scales[j] * (off[m] + more) ** 2)
+            known = sum(p * s for s, p in enumerate(before)) - middle
+            tops = [0.0] * states
+            for m, (i, j) in enumerate(pairs):
+                d = off[m] + more
+                tops[j] += before[i] * weights[m] * exp(scales[j] * d * d)
             total = sum(tops)
             # If no state explains the sample, start again from the stationary law.
             before = [p / total for p in tops] if total > 0.0 else law.tolist()
