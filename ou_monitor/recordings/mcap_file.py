@@ -32,7 +32,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Attachment, Channel, MessageIndex, Metadata, Schema
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
@@ -59,6 +59,7 @@ _IN_DATA = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode
             Opcode.FOOTER}
 _IN_SUMMARY = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
                Opcode.STATISTICS, Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER}
+_UNREAD: dict[int, Any] = {Opcode.ATTACHMENT: Attachment, Opcode.MESSAGE_INDEX: MessageIndex}
 _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
 # Key in a channel's metadata: rate of the samples within a block, Hz.
@@ -260,6 +261,7 @@ class McapFile:
         """Walk the file once; note the places of its messages and its damage."""
         starts = list(chunks)
         statistics: Any = None if self._summary is None else self._summary.statistics
+        private = False
         at, op, in_data = len(MAGIC), 0, True
         while op != Opcode.FOOTER and len(self.breaks) < _MOST_BREAKS:
             place = bisect.bisect_right(starts, at)
@@ -299,6 +301,14 @@ class McapFile:
                         self._learn(op, self._content(file, length, self._limit))
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
+                elif op in _UNREAD and statistics is None and not (
+                        self.spans and self.spans[-1].chunk):
+                    # Without a count of messages, check that a damaged opcode hides none.
+                    _parse(_UNREAD[op], self._content(file, length, self._limit))
+                elif op >= _PRIVATE and statistics is None and not private:
+                    private = True
+                    raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
+                                 'message, and no count shows whether one is missing')
             except Damage as error:
                 # The frame is whole: later records may be intact.
                 self._break(at, error)

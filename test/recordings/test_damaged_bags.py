@@ -211,6 +211,20 @@ def test_the_frame_is_found_again(tmp_path):
         assert read(path, partial=partial).voltage.tolist() == volts()
 
 
+@pytest.mark.parametrize('counted', [True, False])
+def test_a_private_record(tmp_path, counted):
+    """Passed over where the messages are counted, else it may have been one."""
+    path = write(tmp_path / 'bag.mcap', ROWS, use_chunking=False, use_statistics=counted)
+    data = bytearray(path.read_bytes())
+    at = next(r[0] for r in records(bytes(data)) if data[r[0]] == 0x0C)
+    data[at] = 0x9C
+    path.write_bytes(data)
+    found = read(path, partial=True)
+    assert found.voltage.tolist() == volts()
+    notes = [note for note in found.notes if 'private kind' in note]
+    assert len(notes) == (not counted) and all(f'at byte {at}:' in note for note in notes)
+
+
 def test_an_unknown_compression(tmp_path):
     path = write(tmp_path / 'bag.mcap', ROWS, enable_crcs=False)
     path.write_bytes(path.read_bytes().replace(b'zstd', b'zsTd'))
