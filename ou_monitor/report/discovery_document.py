@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import fields
 import math
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
+from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Criticism, Finding
 from ou_monitor.discovery.words import (
     by_load, cause_rows, curve_text, GAIN, gain_text, input_words, parameters,
     plain_words, with_error)
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.records import FloatArray
 from ou_monitor.report.document import (
-    Document, Facts, Figure, Notes, Part, Section, Table, Text)
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import number
+from scipy.signal import welch
 
 # Maximum remaining discrepancies on a terminal.
 _SHOWN = 8
 # Maximum rows of the table of statistics.
 _ROWS = 18
-# Number of simulations for the band of the voltage.
-_DRAWS = 20
+# Number of simulations for a band; bins of load; length of a segment of the spectrum, samples, and
+# points of its curve.
+_DRAWS, _BINS, _SEGMENT, _POINTS = 20, 12, 4096, 60
 
 
 def discovery_document(finding: Finding, seen: Overview | None = None) -> Document:
@@ -42,6 +48,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None) -> Docume
     if baseline is not None:
         after = ' before and after' if finding.causes else ''
         parts += [Section('Causes', _causes(finding)),
+                  lambda: [Section('Recording beside simulations', _beside(finding))],
                   Section('Gain' if finding.causes else 'What it predicts',
                           _gain(finding)),
                   lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True)],
@@ -68,19 +75,79 @@ def _voltage(finding: Finding) -> Plot:
     assert samples is not None
     t = samples.t - samples.t[0]
     plot = Plot('Voltage', 'time, s', 'V', height=230)
-    if finding.simulated is not None:
-        rng = np.random.default_rng(finding.seed)
-        low, high = np.full(samples.n, np.inf), np.full(samples.n, -np.inf)
-        for _ in range(_DRAWS):
-            try:
-                drawn = finding.simulated.simulate(samples.t, rng, samples.throttle)
-            except ValueError:
-                # A model with a diverging force cannot be simulated.
-                break
-            low, high = np.fmin(low, drawn), np.fmax(high, drawn)
-        if np.isfinite(low).all():
-            plot.band(t, low, high, 'simulated', 1)
+    low, high = np.full(samples.n, np.inf), np.full(samples.n, -np.inf)
+    for drawn in _draws(finding, finding.simulated):
+        low, high = np.fmin(low, drawn), np.fmax(high, drawn)
+    if np.isfinite(low).all():
+        plot.band(t, low, high, 'simulated', 1)
     return plot.line(t, samples.logged, 'measured', 0)
+
+
+def _draws(finding: Finding, model: SupplyModel | None) -> Iterator[FloatArray]:
+    """Yield simulated voltages, V, of the samples."""
+    samples, rng = finding.samples, np.random.default_rng(finding.seed)
+    if samples is None or model is None:
+        return
+    # A model with a diverging force cannot be simulated.
+    with suppress(ValueError):
+        for _ in range(_DRAWS):
+            yield model.simulate(samples.t, rng, samples.throttle)
+
+
+def _beside(finding: Finding) -> list[Part]:
+    """Return plots of recording and simulations over load and frequency, and free curves."""
+    samples, ou = finding.samples, finding.baseline
+    if samples is None or ou is None:
+        return []
+    # A model that was not extended is the plain OU.
+    models = {'plain OU': SupplyModel((ou,)), 'extended model': finding.simulated}
+    drawn = {name: [_measures(samples, voltage) for voltage in _draws(finding, model)]
+             for name, model in models.items() if finding.causes or name == 'plain OU'}
+    real = _measures(samples, samples.logged)
+    small: list[Figure] = []
+    load = 'current, A' if finding.load == 'current' else finding.load
+    for k, title, label, unit in ((0, 'Voltage over load', load, 'V'),
+                                  (1, 'Changes between samples', load, 'rms, V'),
+                                  (2, 'Spectrum', 'frequency, Hz', 'V\u00b2/Hz')):
+        x, y = real[k]
+        if x.size < 2:
+            continue
+        x = x * finding.full if label == 'current, A' else x
+        plot = Plot(title, label, unit, width=450, height=250, log_x=k == 2, log_y=k > 0)
+        for colour, (name, found) in enumerate(drawn.items(), 1):
+            if found:
+                many = np.array([one[k][1] for one in found])
+                plot.band(x, many.min(axis=0), many.max(axis=0), name, colour)
+        small.append(Figure(plot.line(x, y, 'measured', 0, 'thick')))
+    for cause in finding.causes:
+        for name, (at, factor) in cause.term.factors().items():
+            plot = Plot(f'{cause.name}: factor on the noise',
+                        by_load(input_words(name), finding.load), 'factor', width=450, height=250)
+            small.append(Figure(plot.line(np.array(at), np.array(factor), '', 0, 'thick')))
+    return [Text(f'Bands: range of {_DRAWS} simulations. Over load, in bins with equal numbers of '
+                 'samples: median of the voltage, and rms of its change to the next sample.',
+                 legend=True), *Pair.two_by_two(small)]
+
+
+def _measures(samples: Samples, voltage: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Return median and rms of changes over load, and the spectrum; each (x, y), shapes (k,)."""
+    u, none, found = samples.throttle, np.empty(0), []
+    if u is None or not np.ptp(u) > 0.0:
+        found = [(none, none)] * 2
+    else:
+        parts = np.array_split(np.argsort(u[:-1], kind='stable'), _BINS)
+        middle = np.array([np.median(u[part]) for part in parts])
+        change = np.diff(voltage)
+        found = [(middle, np.array([np.median(voltage[part]) for part in parts])),
+                 (middle, np.array([math.sqrt(float(np.mean(change[part] ** 2)))
+                                    for part in parts]))]
+    frequency, power = welch(voltage, 1.0 / float(np.median(np.diff(samples.t))),
+                             nperseg=min(voltage.size, _SEGMENT))
+    # Average over bins of equal width on the logarithmic axis.
+    edges = np.unique(np.geomspace(1, frequency.size, _POINTS).astype(int))
+    frequency, power = (np.add.reduceat(one[:edges[-1]], edges[:-1]) / np.diff(edges)
+                        for one in (frequency, power))
+    return [*found, (frequency, power)]
 
 
 def _causes(finding: Finding) -> list[Part]:
