@@ -124,8 +124,8 @@ def _beside(finding: Finding) -> list[Part]:
             plot = Plot(f'{cause.name}: factor on the noise',
                         by_load(input_words(name), finding.load), 'factor', width=450, height=250)
             small.append(Figure(plot.line(np.array(at), np.array(factor), '', 0, 'thick')))
-    return [Text(f'Bands: range of {_DRAWS} simulations. Over load, in bins with equal numbers of '
-                 'samples: median of the voltage, and rms of its change to the next sample.',
+    return [Text(f'Bands: range of {_DRAWS} simulations. Over load, in bins with similar numbers '
+                 'of samples: median of the voltage, and rms of its change to the next sample.',
                  legend=True), *Pair.two_by_two(small)]
 
 
@@ -135,7 +135,9 @@ def _measures(samples: Samples, voltage: FloatArray) -> list[tuple[FloatArray, F
     if u is None or not np.ptp(u) > 0.0:
         found = [(none, none)] * 2
     else:
-        parts = np.array_split(np.argsort(u[:-1], kind='stable'), _BINS)
+        which = np.searchsorted(np.unique(np.quantile(u, np.arange(1, _BINS) / _BINS)), u[:-1],
+                                'right')
+        parts = [np.flatnonzero(which == k) for k in np.unique(which)]
         middle = np.array([np.median(u[part]) for part in parts])
         change = np.diff(voltage)
         found = [(middle, np.array([np.median(voltage[part]) for part in parts])),
