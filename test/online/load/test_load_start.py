@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadModel, LoadStart, SIZE
+from ou_monitor.model.load import LoadModel, LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.online.load.load_filter import LoadFilter
@@ -90,23 +90,6 @@ def test_a_model_file_carries_it(learned, tmp_path):
     monitor.restart(RuntimeError('a fault'))
     monitor.push(t[:50], v[:50], u[:50])
     assert monitor.report(0.0).load.status is LoadStatus.STILL
-
-
-def test_a_file_with_fewer_lags_begins_as_before(learned):
-    kept = np.array([0, 1, 2, 3, 5, 6, SIZE - 1])
-    a, P = np.array(learned.coefficients), np.array(learned.covariance)
-    file = learned.values() | {'coefficients': a[kept].tolist(),
-                               'covariance': P[np.ix_(kept, kept)].tolist()}
-    start = LoadStart.read(file)
-    mean, error = np.array(start.coefficients), np.array(start.covariance)
-    added = np.setdiff1d(np.arange(SIZE), kept)
-    assert (mean[kept] == a[kept]).all() and (mean[added] == 0.0).all()
-    assert (error[np.ix_(kept, kept)] == P[np.ix_(kept, kept)]).all()
-    t, v, u = flight(2)
-    loads = begun(start)
-    loads.push(t[:50], v[:50], u[:50])
-    load = loads.load()
-    assert load.known and abs(load.sag(0.5) - 0.15 * SAG * 0.5 ** 1.8) < 2.0 * load.sag_se(0.5)
 
 
 def test_a_file_without_it_is_as_before():
