@@ -8,7 +8,7 @@ scatter about an even grid, the scatter is real only if the voltage increments f
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -16,7 +16,8 @@ import numpy.typing as npt
 from ou_monitor.criticism.adc import (
     find_rails, find_step, innovation_std, step_words, usual_change, without_repeats)
 from ou_monitor.criticism.readings import load_of, usable, why_no_model
-from ou_monitor.criticism.samples import choose_samples, Samples
+from ou_monitor.criticism.samples import (
+    choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantization, Saturation
 from ou_monitor.model.terms.shocks import outlying
@@ -71,7 +72,17 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     which, note = choose_samples(v, rate)
     if note:
         notes.append(note)
+    lines = lines_between(t, v, which)
+    for line in lines:
+        notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and '
+                     'subtracted from the samples used, whose rate is too low to show it.')
+    between = events_between(v, u, rate, which)
+    origin = float(t[which.start])
+    events = (t[between], without_tones(t[between], v[between], origin, lines),
+              None if u is None else u[between])
     t, v, u = t[which], v[which], None if u is None else u[which]
+    v = without_tones(t, v, origin, lines)
+    exact += lines
     report(0.6)
     drawn = None
     step = find_step(v)
@@ -91,9 +102,19 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     recorded = recording.has_throttle or math.isfinite(full)
     samples = Samples(t, v, _usable_throttle(u, recorded, notes),
                       by_current=math.isfinite(full))
+    if between.size and drawn is None and error == 0.0:
+        samples = _joined(samples, *events)
+        notes.append(f'{between.size} samples around sudden changes were kept as well.')
     samples = samples.spread(samples.voltage, cell, np.random.default_rng(0))
     report(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), full=full, drawn=drawn)
+
+
+def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
+    at = np.searchsorted(samples.t, t)
+    more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
+    return replace(samples, t=np.insert(samples.t, at, t),
+                   voltage=np.insert(samples.voltage, at, v), throttle=more)
 
 
 def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> float:

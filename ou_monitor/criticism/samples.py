@@ -8,6 +8,7 @@ middle is used instead.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
@@ -15,8 +16,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.innovations import steps_before
+from ou_monitor.model.sinusoid import fit_sinusoid, Sinusoid
+from ou_monitor.model.spectral_lines import find_lines
 from ou_monitor.model.terms.term import Segment, Term
+from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
+from scipy.special import ndtri
 
 # Share of the samples for fitting; the rest is held out to score models.
 TRAIN = 0.6
@@ -29,6 +34,20 @@ _STEP = 0.3
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
 # Maximum number of values used for that ratio.
 _EXAMINED = 1_000_000
+# Samples that share a noise scale; probability that noise alone makes any change an event; margin
+# for the error of the scale.
+_SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
+# Minimum change of throttle that counts as a load step, and the time after it in which a change of
+# voltage is attributed to the load, s.
+_STEPS, _SOON = 0.01, 0.02
+# Maximum number of events around which more samples are kept; of more events, the samples used
+# contain enough.
+_FEW = 300
+# Changes are limited to this many standard deviations in the search for lines (larger ones are
+# events); minimum share of a line's power that one sinusoid explains.
+_EVENT, _COMMON = 5.0, 0.5
+# Maximum distance of stamps from an even grid, in steps; number of stamps checked at a time.
+_EVEN, _CHUNK = 0.1, 500_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +167,85 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
         f'{n} samples: of the {size / rate:.4g} s in the middle, {what} ({rate / widest:.4g} Hz), '
         'because the rail relaxes too fast for a lower rate; effects slower than that segment '
         'are not detected.')
+
+
+def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float, which: slice
+                   ) -> npt.NDArray[np.int64]:
+    """Return further samples to keep: around sudden changes (voltage in V, rate in Hz)."""
+    # A jump that is clear between neighbours may be lost in the noise of k steps.
+    first, stop, k = which.start, min(which.stop, voltage.size), which.step or 1
+    none = np.zeros(0, dtype=np.int64)
+    change = np.diff(voltage[first:stop])
+    blocks = change.size // _SHARE
+    if k == 1 or blocks < 1:
+        return none
+    size = np.abs(change[:blocks * _SHARE]).reshape(blocks, _SHARE)
+    scale = np.median(size, axis=1) / 0.6745
+    if not (scale > 0.0).all():
+        # Coarse codes: most changes are 0.
+        return none
+    limit = -_MORE * float(ndtri(0.5 * _CHANCE / change.size))
+    row, column = np.nonzero(size > limit * scale[:, None])
+    at = first + row * _SHARE + column
+    if throttle is not None:
+        stepped = np.flatnonzero(np.abs(np.diff(throttle[first:stop])) > _STEPS) + first
+        last = np.searchsorted(stepped, at, side='right') - 1
+        since = np.where(last < 0, np.inf, at - stepped[last] if stepped.size else 0)
+        at = at[since > _SOON * rate]
+    if not 0 < at.size <= _FEW:
+        return none
+    # The samples before and after the change, and the next, which tells a bad sample from a jump.
+    near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
+    kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
+    return kept
+
+
+def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone]:
+    """Find steady lines in all samples above the Nyquist frequency of the samples used."""
+    # In the samples used, such lines would be aliased, and mostly hidden by noise.
+    k = which.step or 1
+    part = slice(which.start, min(which.stop, voltage.size))
+    t, v = t[part], voltage[part]
+    n = v.size
+    dt = float(t[-1] - t[0]) / max(n - 1, 1)
+    if k == 1 or not all(_even(t[a:a + _CHUNK], t[0] + a * dt, dt)
+                         for a in range(0, n, _CHUNK)):
+        return []
+    e, keep = _whitened(v)
+    found = []
+    for line in find_lines([e], 1.0 / dt, lowest=0.5 / (k * dt)).lines:
+        wave = fit_sinusoid(e, 1.0 / dt, line.frequency, line.resolution)
+        if 0.5 * wave.amplitude ** 2 > _COMMON * line.rms ** 2:
+            turn = 2.0 * math.pi * wave.frequency * dt
+            # The first error belongs to the second sample.
+            gain = 1.0 - keep * np.exp(-1j * turn)
+            found.append(Tone(wave.amplitude / abs(gain), wave.frequency,
+                              wave.phase - turn - float(np.angle(gain)), 0.0))
+    return found
+
+
+def without_tones(t: FloatArray, voltage: FloatArray, origin: float, lines: Sequence[Tone]
+                  ) -> FloatArray:
+    """Return a voltage less steady lines (origin in s, result in V)."""
+    for line in lines:
+        wave = Sinusoid(line.amplitude, line.frequency, line.phase)
+        voltage = voltage - wave.sampled(t - origin)
+    return voltage
+
+
+def _even(t: FloatArray, first: float, dt: float) -> bool:
+    """Return whether stamps lie on an even grid."""
+    return float(np.abs(t - first - dt * np.arange(t.size)).max()) < _EVEN * dt
+
+
+def _whitened(v: FloatArray) -> tuple[FloatArray, float]:
+    """Return the errors of an AR(1) prediction, limited at events, and its coefficient."""
+    c = v - v.mean()
+    keep = float(c[1:] @ c[:-1]) / max(float(c @ c), 1e-300)
+    e: FloatArray = c[1:] - keep * c[:-1]
+    del c
+    limit = _EVENT * float(np.median(np.abs(e[::max(e.size // _CHUNK, 1)]))) / 0.6745
+    return (np.clip(e, -limit, limit, out=e) if limit > 0.0 else e), keep
 
 
 def _widest_step(voltage: FloatArray, factor: int) -> int:

@@ -39,6 +39,8 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
 from ou_monitor.text import listed, number, Z95
 
+# Why the gain of a line above the Nyquist frequency of the samples used is unknown.
+FAST = 'the rate of the samples used is too low to show this line.'
 # Alternations between drawing clipped or coarse samples and fitting the load to them.
 _REDRAWN = 3
 # Number of these alternations that also choose the terms of the load: first from the codes, then
@@ -236,6 +238,8 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
             gain, error = (math.nan, math.nan) if less is None else gain_of(
                 left.full, held_out(samples, less), scored)
             why = '' if math.isfinite(gain) else NO_OTHER if less is None else VAGUE
+        elif term.FAMILY == 'line':
+            gain, error, why = math.nan, math.nan, FAST
         else:
             gain, error = 0.0, 0.0
         shown = with_reach(term, {}, samples)

@@ -6,7 +6,7 @@ import tracemalloc
 import numpy as np
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.criticism.integrity import _judge_step, examine, judge_stamps, LEAST
-from ou_monitor.criticism.samples import choose_samples, MOST
+from ou_monitor.criticism.samples import choose_samples, events_between, MOST
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Recording
 import pytest
@@ -212,6 +212,47 @@ def test_long_recordings_bound_memory():
     tracemalloc.stop()
     assert names(found) == ['held_samples'] and found.samples.n <= MOST
     assert peak < 10 * 8 * n
+
+
+def test_a_line_faster_than_the_samples_used_is_found_in_all():
+    """Half a million samples at 100 kHz of which every 7th is used: a line at 31 kHz."""
+    # Whitened, it gains n amplitude^2 |1 - phi exp(-iw)|^2 / (4 step^2) = 60 nats; phase and
+    # amplitude then have standard errors of sqrt(1 / 120) and that share of the amplitude.
+    n, rate = 500_000, 1e5
+    t, v = rail(12, n, rate)
+    step = np.diff(v).std()
+    turn = 2.0 * math.pi * 31_234.5 / rate
+    amplitude = math.sqrt(60.0 * 4.0 * step**2 / n) / abs(1.0 - np.exp(-1j * turn))
+    line = amplitude * np.sin(2.0 * math.pi * 31_234.5 * (t - t[0]) + 1.0)
+    assert not names(examined(t, v))
+    found = examined(t, v + line)
+    (tone,) = [term for term in found.exact if term.NAME == 'tone']
+    assert tone.frequency == pytest.approx(31_234.5, abs=0.1)
+    assert tone.amplitude == pytest.approx(amplitude, rel=4.0 * math.sqrt(1.0 / 120.0))
+    assert any('31234.5 Hz' in note for note in found.notes)
+    # What is left of it at the samples used.
+    plain = examined(t, v).samples
+    rest = found.samples.voltage - plain.voltage
+    assert np.abs(rest).max() < 6.0 * math.sqrt(2.0 / 120.0) * amplitude
+
+
+def test_events_that_only_neighbours_show_are_kept():
+    """Jumps of 8 deviations of a step: the samples on both sides; none after throttle."""
+    n, rate = 500_000, 1e5
+    t, v = rail(13, n, rate)
+    where = np.array([40_001, 123_458, 250_003])
+    for k in where:
+        v[k:] += 8.0 * np.diff(v[:1000]).std()
+    plain = choose_samples(v, rate)[0]
+    kept = events_between(v, None, rate, plain)
+    assert {*where, *(where - 1)} <= {*kept, *range(0, n, plain.step)}
+    assert kept.size <= 3 * where.size
+    u = np.where(np.arange(n) < where[1], 0.2, 0.6)
+    assert not {where[1] - 1, where[1]} & {*events_between(v, u, rate, plain)}
+    found = examined(t, v)
+    assert found.samples.n == v[plain].size + kept.size
+    assert (np.diff(found.samples.t) > 0.0).all()
+    assert not events_between(rail(14, n, rate)[1], None, rate, plain).size
 
 
 @pytest.mark.parametrize('times, named', [(0.25, False), (0.297, False), (0.303, True),
