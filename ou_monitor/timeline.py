@@ -455,9 +455,11 @@ _TIED = 0.25
 
 def plausible(values: FloatArray, most: float) -> FloatArray:
     """Return values with NaN where the magnitude exceeds `most`."""
-    # Comparisons with NaN are false, so NaN stays.
-    beyond = (values > most) | (values < -most)
-    return np.where(beyond, NAN, values) if beyond.any() else values
+    # `fmin` and `fmax` ignore NaN; comparisons with NaN are false, so NaN stays.
+    if -most <= np.fmin.reduce(values, initial=most) and np.fmax.reduce(
+            values, initial=-most) <= most:
+        return values
+    return np.where(np.abs(values) > most, NAN, values)
 
 
 def plausible_stamps(name: str, t: FloatArray) -> FloatArray:

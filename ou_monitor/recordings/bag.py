@@ -280,7 +280,7 @@ def read_fields(
         return FieldReader(spec, bag.definitions(spec.type), refuse, second)
 
     readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}
-    found = {name: ColumnBuffer(bag.counts[spec.topic]) for name, spec in specs.items()}
+    found = {name: ColumnBuffer() for name in specs}
     counts = dict.fromkeys(specs, 0)
     for part in bag.tables([spec.topic for spec in specs.values()], end_ns, as_written=True):
         for name, reader in readers.items():

@@ -4,7 +4,7 @@ The voltage samples of a bag with their throttle and current.
 A msg config fits if the bag has its topic, possibly in a namespace, with its type. If none fits, a
 generic config fits if a topic other than its throttle's has its type. The user must choose if
 several configs or topics fit.
-Limits: all samples of a bag are held in memory, 150 MB for an hour at 1 kHz.
+Limits: all samples of a bag are held in memory, 145 MB for an hour at 1 kHz.
 """
 
 from __future__ import annotations
@@ -261,7 +261,8 @@ def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArr
     if spec.nan == 'drop':
         finite = np.isfinite(column.values)
         usable, unknown = usable & finite, int(np.count_nonzero(~finite))
-    column = column.take(np.flatnonzero(usable))
+    if not usable.all():
+        column = column.take(np.flatnonzero(usable))
     hold = ThrottleHold(sample_rate)
     # At equal log times the throttle counts as earlier than the voltage.
     before = np.searchsorted(log_time, column.log_time, 'left')

@@ -348,35 +348,30 @@ _NO_MESSAGE = FieldColumn(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bo
 
 
 class ColumnBuffer:
-    """The columns of many parts, joined as they come (messages: their expected number)."""
+    """The columns of many parts, joined as they come; views of one value stay views."""
 
-    def __init__(self, messages: int) -> None:
-        self._messages = messages
-        self._store: list[npt.NDArray[Any]] = list(_NO_MESSAGE)
-        self._sizes = [0] * len(self._store)
+    # A `bytearray` grows in place: parts and whole, or an array and a larger one, would take
+    # twice the memory.
+
+    def __init__(self) -> None:
+        self._views: list[npt.NDArray[Any]] = list(_NO_MESSAGE)
+        self._stores = [bytearray() for _ in self._views]
 
     def add(self, part: FieldColumn) -> None:
         """Append a part."""
-        share = self._messages / max(part.n, 1)
-        for k, piece in enumerate(part):
-            store, size = self._store[k], self._sizes[k]
-            self._sizes[k] += piece.size
-            if not piece.strides[0] and (not size or not store.strides[0]):
-                # Views of one value: join them as a view of it.
-                if piece.size:
-                    self._store[k] = np.broadcast_to(piece[0], self._sizes[k])
+        for k, (store, view, piece) in enumerate(zip(self._stores, self._views, part)):
+            if not store and piece.size and not piece.strides[0] and (
+                    not view.size or np.array_equal(view[:1], piece[:1], equal_nan=True)):
+                self._views[k] = np.broadcast_to(piece[0], view.size + piece.size)
                 continue
-            n = self._sizes[k]
-            if n > store.size or not store.flags.writeable:
-                # Parts and whole would take twice the memory; a bag may overstate its messages.
-                whole = np.empty(max(2 * n, min(int(share * piece.size), 16 * n)), piece.dtype)
-                whole[:size] = store[:size]
-                self._store[k] = store = whole
-            store[size:n] = piece
+            if not store:
+                store += view.tobytes()
+            store += np.ascontiguousarray(piece).data
 
     def whole(self) -> FieldColumn:
         """Return all parts as one."""
-        return FieldColumn(*(store[:size] for store, size in zip(self._store, self._sizes)))
+        return FieldColumn(*(np.frombuffer(store, view.dtype) if store else view
+                             for store, view in zip(self._stores, self._views)))
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
@@ -421,7 +416,7 @@ class FieldReader:
         """Return the field of the messages of a table, in its order."""
         n = table.n
         stamp, count = np.full(n, np.nan), np.zeros(n, np.int64)
-        beside = np.full(n, np.nan) if len(self._fields) > 1 else np.broadcast_to(np.nan, n)
+        beside = nothing = np.broadcast_to(np.nan, n)
         # Indices of messages of one layout, shape (k,); their values, shape (k, values in each).
         blocks: list[tuple[IntArray, FloatArray]] = []
         kept, refused = np.ones(n, np.bool_), dict[int, str]()
@@ -432,13 +427,17 @@ class FieldReader:
                 block, *other = (self._values(layout, rows, *field) for field in self._fields)
                 blocks.append((picked, block))
                 count[picked] = block.shape[1]
-                if other and other[0].shape[1] == 1:
+                # Values that are not measured take no memory.
+                if other and other[0].shape[1] == 1 and not np.isnan(other[0]).all():
+                    beside = np.full(n, np.nan) if beside is nothing else beside
                     beside[picked] = other[0][:, 0]
         for k, why in sorted(refused.items()):
             self._broken(int(table.log_time[k]), why)
             kept[k] = False
         stamped = ~np.isnan(stamp)
-        if not stamped.all():
+        if stamped.all():
+            stamped = np.broadcast_to(np.True_, n)
+        else:
             stamp[~stamped] = seconds(table.log_time[~stamped])
         if len(blocks) == 1 and blocks[0][0].size == n:
             values = blocks[0][1].reshape(-1)
@@ -471,7 +470,8 @@ class FieldReader:
                 ) -> Iterator[tuple[IntArray, Rows, Layout]]:
         """Yield messages by layout (indices, rows, layout); record why others are refused."""
         lengths = table.end - table.begin
-        for length in np.unique(lengths).tolist():
+        one_length = lengths.size and lengths.min() == lengths.max()
+        for length in (lengths[:1] if one_length else np.unique(lengths)).tolist():
             left = np.nonzero(lengths == length)[0]
             rows = table.rows(left, length)
             known = self._layouts.setdefault(length, [])

@@ -507,12 +507,11 @@ class McapFile:
         with opened(self.path) as file:
             table = joined([self._table_of(file, span) for span in spans])
         topics: dict[str, npt.NDArray[np.bool_]] = {}
-        channels = self.channels_of(wanted)
-        for key in np.unique(table.channel).tolist():
-            if key in channels:
+        for key, name in self.channels_of(wanted).items():
+            mine = table.channel == key
+            if mine.any():
                 # Two publishers of one topic are two channels.
-                name = channels[key]
-                topics[name] = topics.get(name, False) | (table.channel == key)
+                topics[name] = topics[name] | mine if name in topics else mine
         return {name: table.where(mine) for name, mine in topics.items()}
 
     def _table_of(self, file: BinaryIO, span: Span) -> MessageTable:

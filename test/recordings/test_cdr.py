@@ -320,13 +320,17 @@ def test_time_order_keeps_the_fields_of_a_message_together():
     assert column.values.tolist() == [1, 2, 2, 2, 4, 4, 0, 0]
     first, rest = column.split(3)
     assert (first.values.tolist(), rest.log_time.tolist()) == ([1, 2, 2, 2], [20, 30])
-    buffer = ColumnBuffer(6)
+    buffer = ColumnBuffer()
     for part in (first, rest, first._replace(beside=np.arange(3.0))):
         buffer.add(part)
     whole = buffer.whole()
     for name in column._fields:
         np.testing.assert_array_equal(getattr(whole.split(5)[0], name), getattr(column, name))
     assert whole.counts.tolist()[5:] == [0, 1, 3] and whole.beside.tolist()[5:] == [0, 1, 2]
+    buffer = ColumnBuffer()
+    for stamped in (True, True, False):
+        buffer.add(first._replace(stamped=np.broadcast_to(stamped, 3)))
+    assert buffer.whole().stamped.tolist() == [True] * 6 + [False] * 3
 
 
 def test_log_times_of_any_size():
