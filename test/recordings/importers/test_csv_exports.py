@@ -483,6 +483,17 @@ FORMS = {
     # The lowest and the highest of each interval.
     'rohde_pairs': (table(['in s,C1 in V'], lambda k: (
         f'{0.1 * k:.6E},{V[k] + 0.1:.4E}\n{0.1 * k:.6E},{V[k]:.4E}')), 0.1, False, False),
+    # A battery tester: a line for each cycle and step above its indented records.
+    'outer_tables': (table(
+        ['Cycle,Cap(Ah),Time', ',Step,Name,End(V),Time', ',,Record,Total Time,Voltage(V),Date'],
+        lambda k: f'{k // 30},0.02,0.33\n,{k // 10},Rest,{V[k]},0:01:00\n' * (k % 10 == 0) + (
+            f',,{k},0:00:{k:02},{V[k]},02/21/2020 10:32:{k:02}')), 1.0, False, False),
+    # A voltage with a current of its name is preferred.
+    'two_packs': (table(['t,12V battery voltage,HV battery voltage,HV battery current'],
+                        lambda k: f'{k},{5 + k % 2},{V[k]},{AMPS[k]}'), 1.0, False, True),
+    # Decimal commas between commas: each number takes two cells.
+    'split_numbers': (table(['Time (ms),Voltage (V),Current (A)'], lambda k: german(
+        f'{20.0 * k:.3f};{V[k]:.3f};{AMPS[k]:+.3f}').replace(';', ',')), 0.02, False, True),
 }
 
 
@@ -511,6 +522,7 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     assert len({*found.source} - {'time_unit'}) == 3 + throttle + current
     said = [note for note in found.notes if note.startswith('Read time from')]
     assert len(said) == (form != 'plain')
+    assert form != 'outer_tables' or 'without rows of outer tables' in said[0]
     # Dates are not taken for a time in ms.
     assert not any('apart' in note for note in found.notes)
     # The bag that `convert` writes holds the same samples.
@@ -703,11 +715,6 @@ def test_labels_are_names_only_if_each_row_has_them(tmp_path):
         read_recording(written(tmp_path, rows))
 
 
-def test_a_cell_beyond_the_range_is_missing(tmp_path):
-    path = written(tmp_path, 't,U,I\n0,12,1\n1,OL,1\n2,13,∞\n3,14,1\n')
-    np.testing.assert_allclose(read_recording(path).voltage, [12, 13, 14])
-
-
 @pytest.mark.parametrize('step, atol', [
     (np.full(900, 0.104), 0.1), (np.where(np.arange(900) == 400, 33.3, 0.1), 0.1),
     (np.random.default_rng(1).uniform(0.08, 0.12, 900), 0.3), (np.full(900, 1.0 / 101.0), 0.02)])
@@ -869,7 +876,7 @@ def test_a_known_mark_makes_the_other_one_separate_thousands(delimiter, decimal,
 
 def test_words_of_loggers_for_a_missing_number(tmp_path):
     """They are counted, not refused; a factor in the unit of a column is applied."""
-    words = ['OL', '----', '--.--', '1.#QNAN', '-1.#IND']
+    words = ['OL', '∞', '----', '--.--', '1.#QNAN', '-1.#IND']
     found = read_recording(written(tmp_path, 'time,VBAT (x10 mV)\n' + ''.join(
         f'{k},{word}\n' for k, word in enumerate(['1200', *words, '1210']))))
     assert found.voltage.tolist() == [12.0, pytest.approx(12.1)]
@@ -1009,18 +1016,6 @@ def test_hours_between_samples_are_believed(tmp_path):
             item.name == 'TIME_UNIT' for item in found.quality)
 
 
-def test_rows_of_outer_tables_are_left_out(tmp_path):
-    """A battery tester writes a line for each cycle and step above its indented records."""
-    names = ['Cycle,Cap(Ah),Time', ',Step,Name,End(V),Time',
-             ',,Record,Time,Total Time,Voltage(V),Date']
-    path = written(tmp_path, table(names, lambda k: (
-        f'{k // 30},0.02,0.33\n,{k // 10},Rest,{V[k]},0:01:00\n' * (k % 10 == 0) +
-        f',,{k},0:00:{k % 10:02},0:00:{k:02},{V[k]},02/21/2020 10:32:{k:02}')))
-    found = read_recording(path)
-    assert found.voltage.tolist() == V.tolist() and np.ptp(found.t) == N - 1
-    assert 'without rows of outer tables' in found.notes[0]
-
-
 def test_a_late_line_does_not_change_the_time(tmp_path):
     """Another time that only rises is no reason to leave the one that is named best."""
     t = 0.1 * K
@@ -1040,25 +1035,6 @@ def test_a_time_with_decimals_is_finer_than_a_clock(tmp_path):
     # Without a unit it may be in minutes.
     path = written(tmp_path, path.read_text().replace('Test_Time(s)', 'Test_Time'))
     assert read_recording(path).t[0] > 1e9
-
-
-def test_a_voltage_with_a_current_of_its_name_is_preferred(tmp_path):
-    path = written(tmp_path, table(
-        ['t,12V battery voltage,HV battery voltage,HV battery current'],
-        lambda k: f'{k},{13 + k % 2},{350 + V[k]},{AMPS[k]}'))
-    np.testing.assert_allclose(read_recording(path).voltage, 350.0 + V)
-
-
-def test_decimal_commas_between_commas(tmp_path):
-    """Each number takes two cells of a row; a row of another width is refused."""
-    rows = [[german(f'{one:.3f}') for one in (20.0 * k, V[k], -AMPS[k])] for k in range(N)]
-    text = 'Time (ms),Voltage (V),Current (A)\n' + ''.join(','.join(row) + '\n' for row in rows)
-    found = read_recording(written(tmp_path, text))
-    np.testing.assert_allclose(found.voltage, V)
-    np.testing.assert_allclose(found.t, 0.02 * K)
-    np.testing.assert_allclose(found.current, -AMPS)
-    with pytest.raises(InputError, match=':62: 5 cells'):
-        read_recording(written(tmp_path, text + '1200,000,15,300,2\n'))
 
 
 @pytest.mark.parametrize('row', [
@@ -1147,7 +1123,8 @@ def test_a_file_of_another_kind_is_named(content, words, tmp_path):
     ('date,U\n2024-01-01 33:00,12\n2024-01-02 33:00,12\n', 'hour'),
     ('time,U\n10:00:00,12\n10:00:99,12\n', "'10:00:99'"),
     ('time,U\n10:00:00,12\n10:99:00,12\n', "'10:99:00'"),
-    ('time,U\n10:00:00,12\n10:00:01+99:99,12\n', r"'10:00:01\+99:99'")])
+    ('time,U\n10:00:00,12\n10:00:01+99:99,12\n', r"'10:00:01\+99:99'"),
+    (FORMS['split_numbers'][0] + '1200,000,15,300,2\n', ':62: 5 cells')])
 def test_cells_that_are_no_time_or_number_are_refused(content, words, tmp_path):
     with pytest.raises(InputError, match=words):
         read_recording(written(tmp_path, content))
