@@ -164,7 +164,7 @@ def test_filter_parameters_are_listed():
              for key in ('topic', 'type', 'field')]
     assert listed == {
         'input.type': 'auto', 'input.field': 'none',
-        'msg_config': 'auto',
+        'msg_config': 'auto', 'publish_rate': '10',
         **dict.fromkeys(where, 'none'), **{
             p.name: f'{p.default:g}' if isinstance(p.default, float) else str(p.default).lower()
             for p in (*FILTER_PARAMETERS, *NOTCH_PARAMETERS)}}

@@ -43,6 +43,17 @@ _RAMP = 0.2
 _SHARE_OF_RISE = INRUSH_TIME / _RAMP
 
 
+# Length of a block, s; time that is kept, s; maximum silence that is filled, s.
+BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
+# Throttle within this distance of the highest throttle belongs to the peak.
+AT_PEAK = 0.05
+# `brief`, the squared relative error of the predicted fall, falls from 1 for a peak of one block
+# with the squared number of blocks (the dwell is known to about a block), but not below this.  On
+# gecko, nazgul, roma and hiro the error beyond noise is 0.1 to 0.5 of the squared fall for one
+# block, and at most 0.01 from 0.15 s on.
+_LASTING = 0.1
+
+
 def _integral(y: FloatArray, x: FloatArray) -> float:
     """Return the integral by trapezoids (NumPy's function has different names in 1.26 and 2)."""
     return float(0.5 * np.sum(np.diff(x) * (y[1:] + y[:-1])))
@@ -137,8 +148,8 @@ def mean_now(state: LoadState) -> float:
 
 
 def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling: Sampling
-           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean, noise and error of the lowest voltage of each course, V; shapes (k,)."""
+           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return mean, noise and error of each lowest voltage, V, and `brief`; shapes (k,)."""
     peak, dt = courses.peak, sampling.interval
     span = np.maximum(horizon, dt)
     stay = np.clip(courses.dwell, dt, span)
@@ -170,13 +181,8 @@ def lowest(state: LoadState, courses: Courses, horizon: npt.ArrayLike, sampling:
     slope = (c[2] + c[5:5 + len(LAGS)].sum()) * POWER * peak ** (POWER - 1.0) + (
         c[3] + c[5 + len(LAGS):-1].sum()) + 3.0 * c[4] * peak ** 2
     noise = np.hypot(sd * np.interp(ln_n, _LN_N, _DEVIATION), AT_PEAK / math.sqrt(12.0) * slope)
-    return mean - sd * np.interp(ln_n, _LN_N, _MEAN), noise, np.sqrt(known)
-
-
-# Length of a block, s; time that is kept, s; maximum silence that is filled, s.
-BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
-# Throttle within this distance of the highest throttle belongs to the peak.
-AT_PEAK = 0.05
+    brief = np.maximum((BLOCK / np.maximum(stay, BLOCK)) ** 2, _LASTING)
+    return mean - sd * np.interp(ln_n, _LN_N, _MEAN), noise, np.sqrt(known), brief
 
 
 class FlightHistory:

@@ -9,8 +9,8 @@ passage.
 
 Law learned in flight, by least squares with forgetting over completed horizons: lowest - start =
 b0 s + b1 (mu - start) + e.  start is the mean voltage at the beginning; `lowest` gives mean mu,
-noise s and error r.  e has Student's t distribution with five degrees of freedom, and the variance
-k0 s^2 + k1 (mu - start)^2 + k2 r^2.
+noise s, error r and `brief` f.  e has Student's t distribution with five degrees of freedom, and
+the variance k0 s^2 + k1 f (mu - start)^2 + k2 r^2.
 
 A law is mixed with a wider one, whose weight is the share of horizons that contradict the law
 (rule of succession).  A horizon counts by the probability that the law was wrong in it, times
@@ -27,6 +27,7 @@ two horizons.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 from statistics import median
@@ -53,9 +54,9 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
 # Prior of the law: weight of the variances, in horizons; k0 (1 to 6 on nine recorded flights, from
-# gecko to cf_takeoff), k1 (0.015 to 0.09 on these flights) and k2 (1: the error stated by the load
-# filter is right); precision matrix of bias and gain (elements 00, 01, 11).
-_PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03, 1.0])
+# gecko to cf_takeoff), k1 (a peak of one block: see `courses`) and k2 (1: the error stated by the
+# load filter is right); precision matrix of bias and gain (elements 00, 01, 11).
+_PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.1, 1.0])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
 # Memory, s; limit of squared standardised errors; standardised error above which errors weigh less
 # in the regression.
@@ -108,13 +109,14 @@ class LowestLaw:
     def __init__(self, values: FloatArray) -> None:
         self.values = values
 
-    def moments(self, mean: FloatArray, noise: FloatArray, error: FloatArray, start: float
+    def moments(self, parts: Sequence[FloatArray], start: float
                 ) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation, V, of the lowest voltage, errors of the law included."""
+        """Return mean and deviation, V, with errors of the law; parts: from `lowest`."""
+        mean, noise, error, brief = parts
         bias, gain, k0, k1, k2, c00, c01, c11 = self.values.tolist()
         x = mean - start
         return start + bias * noise + gain * x, np.sqrt(
-            (k0 + c00) * noise * noise + 2.0 * c01 * noise * x + (k1 + c11) * x * x
+            (k0 + c00) * noise * noise + 2.0 * c01 * noise * x + (k1 * brief + c11) * x * x
             + k2 * error * error)
 
 
@@ -138,13 +140,14 @@ class Calibrator:
         self.law = LowestLaw(np.array([*self._b, *self._variance, b / whole, -both / whole,
                                        a / whole]))
 
-    def add(self, low: float, mean: float, noise: float, error: float, start: float,
-            weight: float, elapsed: float) -> None:
-        """Learn from a completed horizon: lowest, predicted (see `lowest`) and start, V."""
+    def add(self, low: float, predicted: Sequence[float], start: float, weight: float,
+            elapsed: float) -> None:
+        """Learn from a completed horizon: lowest, V, predicted (see `lowest`) and start, V."""
+        mean, noise, error, brief = predicted
         keep = math.exp(-elapsed / MEMORY)
         x, y = mean - start, low - start
         miss = y - self._b[0] * noise - self._b[1] * x
-        parts = self._variance * np.array([noise * noise, x * x, error * error])
+        parts = self._variance * np.array([noise * noise, brief * x * x, error * error])
         total = float(parts.sum())
         least = weight / total * min(1.0, _HUBER * math.sqrt(total) / max(abs(miss), 1e-9))
         # Each variance learns in proportion to its share of the total (score equations).
@@ -272,14 +275,13 @@ class _HorizonLaws:
             parts = lowest(
                 begun.state, courses.after(held(peak, dwell, begun.state.throttle)), self.horizon,
                 sampling)
-            middle, spread = law.moments(*parts, start)
+            middle, spread = law.moments(parts, start)
             found = density(y, middle, spread)
             wide = density(y, middle[:1], _wider(spread[:1], begun.deviation, self.held.misses))
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
                           max(float(middle[0] - low), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
-            mean, noise, error = (part.item(0) for part in parts)
-            self.calibrator.add(low, mean, noise, error, start, weight, elapsed)
+            self.calibrator.add(low, [part.item(0) for part in parts], start, weight, elapsed)
         if begun.passage is not None:
             self.passage.add(begun.passage.density(low, self.horizon), other, weight, elapsed)
 
@@ -480,7 +482,7 @@ class Forecast:
             courses, shares = pilot(self._flown(horizon), state.throttle, horizon)
             # At idle, at the present throttle, and with the pilot's future throttle.
             every = courses.after(held([0.0, state.throttle], horizon, state.throttle))
-            each = below(voltage, *law.moments(*lowest(state, every, horizon, self._sampling),
+            each = below(voltage, *law.moments(lowest(state, every, horizon, self._sampling),
                                                mean_now(state)))
             parts = each.item(0), each.item(1), float(shares @ each[2:])
             risk, basis = _HALF * far + (1.0 - _HALF) * parts[2], 'load'
@@ -538,9 +540,9 @@ class Forecast:
         parts = np.split(np.stack(lowest(state, courses, within, self._sampling)),
                          len(horizons), axis=1)
         start, risks = mean_now(state), []
-        for one, deviation, (mean, own, error) in zip(horizons, drops, parts):
+        for one, deviation, part in zip(horizons, drops, parts):
             law, wrong, n, squares, *_ = self._learned(one)
-            middle, spread = law.moments(mean, own, error, start)
+            middle, spread = law.moments(list(part), start)
             either = below(voltage, middle, np.stack((
                 _wider(spread, deviation, (n, sag * sag * squares)), spread)))
             risks.append(wrong * either[0] + (1.0 - wrong) * either[1])
