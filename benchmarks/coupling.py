@@ -21,7 +21,7 @@ from ou_monitor.analysis.coupling import estimate_coupling
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.log import Request
+from ou_monitor.recordings.importers.log import IMU, Request
 from scipy import stats
 from scipy.signal import lfilter
 
@@ -57,13 +57,13 @@ def flights(folder: Path) -> Iterator[Flight]:
         volts = 'battery_status[1].voltage_v' if name == 'px4' else None
         chosen = choose(path, log, voltage=volts)
         axes = {f'{one.name} {axis}': one.values[:, k]
-                for one in log.inertial if one.t.size == log.inertial[0].t.size
+                for one in log.of(IMU) if one.t.size == log.of(IMU)[0].t.size
                 for k, axis in enumerate('xyz')}
         series = chosen.throttle
         throttle = (np.full(chosen.voltage.n, np.nan) if series is None else
                     np.interp(chosen.voltage.t, series.t, series.values))
         yield Flight(name, chosen.voltage.t, chosen.voltage.values, throttle,
-                     log.inertial[0].t, axes)
+                     log.of(IMU)[0].t, axes)
     for name, file in TABLES.items():
         path = folder / file
         if path.exists():

@@ -13,7 +13,7 @@ from common import FLIGHTS as known, recorded, say
 import numpy as np
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.log import Request
+from ou_monitor.recordings.importers.log import IMU, Request, SPEEDS
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight, which gyro.
 FLIGHTS = (
@@ -45,15 +45,15 @@ def read(name: str, seconds: float = np.inf) -> Gyro | None:
         say(f'{name}: {file} is not there, left out')
         return None
     log = import_log(where / file, Request(number, poles=14 if name == 'bf3s' else None))
-    (gyro,) = (one for one in log.inertial if one.name == kind)
+    (gyro,) = (one for one in log.of(IMU) if one.name == kind)
     part = gyro.t - gyro.t[0] <= seconds
     t = gyro.t[part]
     throttle = choose(where / file, log).throttle
     assert throttle is not None
     held = throttle.values[np.clip(np.searchsorted(throttle.t, t, 'right') - 1, 0, None)]
     rpm = None
-    if log.speeds is not None:
-        place = np.clip(np.searchsorted(log.speeds.t, t, 'right') - 1, 0, None)
-        rpm = 60.0 / (2.0 * np.pi) * log.speeds.values[place]
+    if log.of(SPEEDS):
+        place = np.clip(np.searchsorted(log.of(SPEEDS)[0].t, t, 'right') - 1, 0, None)
+        rpm = 60.0 / (2.0 * np.pi) * log.of(SPEEDS)[0].values[place]
     return Gyro(name, t - t[0], (t.size - 1) / float(t[-1] - t[0]),
                 np.degrees(gyro.values[part, :3]), held, rpm)

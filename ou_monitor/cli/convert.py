@@ -70,14 +70,14 @@ def _topic_contents(chosen: Any, extras: dict[str, Any]) -> dict[str, dict[str, 
 
 def _list(args: argparse.Namespace, log: Any) -> int:
     import numpy as np
-    from ou_monitor.recordings.importers.choose import default, default_gyro
-    from ou_monitor.recordings.importers.log import CURRENT, SIGNAL, THROTTLE, VOLTAGE
+    from ou_monitor.recordings.importers.choose import default
+    from ou_monitor.recordings.importers.log import CURRENT, IMU, SIGNAL, SPEEDS, THROTTLE, VOLTAGE
 
     taken = {quantity: [one.name for one in default(log, quantity)]
              for quantity in (VOLTAGE, THROTTLE, CURRENT)}
     rows = []
     order = (VOLTAGE, THROTTLE, CURRENT, 'any', SIGNAL)
-    for one in sorted(log.series, key=lambda one: (
+    for one in sorted(log.scalars, key=lambda one: (
             one.quantity not in order, order.index(one.quantity) if one.quantity in order else 0,
             one.rank is None, one.rank or 0)):
         known = one.values[np.isfinite(one.values)]
@@ -87,10 +87,13 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             'default': one.name in taken.get(one.quantity, ()), 'n': one.n,
             'rate_hz': one.rate, 'min': low, 'max': high, 'unit': one.unit,
             'repeats': one.repeats, 'scale': one.scale})
-    gyros = _gyros(log, default_gyro(log))
+    gyros = [{'name': one.name, 'what': one.words, 'n': one.n, 'scale': one.scale,
+              'angular_velocity': True, 'acceleration': one.values.shape[1] > 3,
+              'default': one in default(log, IMU)[:1]} for one in log.of(IMU)]
     several = [f'Several series are candidates for {quantity}: choose by --{quantity} NAME.'
                for quantity in (VOLTAGE, THROTTLE) if len(taken[quantity]) > 1]
-    speeds = [] if log.speeds is None else log.speeds.name.split(', ')
+    motors = log.of(SPEEDS)
+    speeds = [name for one in motors for name in one.name.split(', ')]
     parts: list[Part] = [
         Table(('', 'quantity', 'name', 'samples', 'rate Hz', 'min', 'max', 'unit', 'repeats',
                'what'), [
@@ -101,17 +104,10 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             ['*' if row['default'] else '', row['name'], str(row['n']), row['what']
              + ('' if row['acceleration'] else ', no accelerometer')] for row in gyros],
               left=(0, 1, 3)),
-        Text(f'* /motor_speed: {log.speeds.words}, {log.speeds.n} samples, '
-             f"{', '.join(speeds)}" if speeds else ''), Notes.of([*several, *log.notes])]
+        Text(''.join(f'* /motor_speed: {one.words}, {one.n} samples, {one.name}'
+                     for one in motors)), Notes.of([*several, *log.notes])]
     output.tell(args, Document('A log', f'{args.log}: {log.format}' + ''.join(
         f', {name} {value}' for name, value in log.facts.items()), (), parts), lambda: {
             'log': str(args.log), 'format': log.format, 'facts': log.facts, 'series': rows,
             'imu': gyros, 'motor_speed': speeds, 'notes': log.notes})
     return 0
-
-
-def _gyros(log: Any, taken: Any) -> list[dict[str, Any]]:
-    return [{'name': one.name, 'what': one.words, 'n': one.n, 'scale': one.scale,
-             'angular_velocity': True, 'acceleration': one.values.shape[1] > 3,
-             'default': one is taken}
-            for one in log.inertial]

@@ -107,10 +107,9 @@ def read(path: Path, request: Request) -> Log:
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
     units = _units(headers)
     series += _signals(t, columns, units, {one.name for one in series})
-    inertial = [*_gyros(t, columns, headers, units, notes)]
-    speeds = _speeds(t, columns, headers, notes, request.poles)
-    return log_of('blackbox', series, facts, notes, (name for name in names if name != 'time'),
-                  inertial, speeds)
+    series += _gyros(t, columns, headers, units, notes)
+    series += _speeds(t, columns, headers, notes, request.poles)
+    return log_of('blackbox', series, facts, notes, (name for name in names if name != 'time'))
 
 
 def _wanted(names: list[str], request: Request) -> list[str]:
@@ -362,23 +361,23 @@ def _signals(t: FloatArray, columns: Fields, units: Units, known: set[str]) -> I
 
 
 def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
-            poles: int | None) -> Series | None:
+            poles: int | None) -> Iterator[Series]:
     places = sorted(int(found[1]) for name in columns
                     if (found := re.fullmatch(r'eRPM\[(\d+)\]', name)))
     if not places:
-        return None
+        return
     stated = _number(headers, 'motor_poles')
     count = poles or int(stated)
     if count < 2:
         notes.append('eRPM was left out: the header does not state motor_poles; give --poles N, '
                      'the magnets of a rotor (14 is common).')
-        return None
+        return
     # eRPM is logged in hundreds; each pair of poles makes one electrical turn per turn of the
     # shaft.
     scale = 100.0 * RPM * 2.0 / count
     origin = '--poles' if poles else 'the header'
-    return speeds_of(t, [columns[f'eRPM[{k}]'] for k in places], scale, 'eRPM',
-                     f'rotor speed, {count} poles by {origin}', places)
+    yield from speeds_of(t, [columns[f'eRPM[{k}]'] for k in places], scale, 'eRPM',
+                         f'rotor speed, {count} poles by {origin}', places)
 
 
 def _number(headers: Headers, key: str) -> float:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 import re
 
@@ -46,7 +47,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     """Choose series, drop unusable samples (option: pattern of option names, for errors)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
-        others = _series_of(log, VOLTAGE) + _series_of(log, ANY)
+        others = log.of(VOLTAGE, ANY)
         raise InputError(f'{path} ' + (
             f'has no battery voltage; choose another with {option.format(VOLTAGE)} NAME: '
             f'{_names_of(others)}' if others else 'holds no voltage')
@@ -65,7 +66,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
                          + ', '.join(names))
     notes: list[str] = []
     if second is None and current is None and (
-            held := [one for one in _series_of(log, CURRENT) if not one.silent]):
+            held := [one for one in log.of(CURRENT) if not one.silent]):
         notes.append('No current clearly belongs to this voltage, so none is used; found: '
                      + _names_of(held) + f' ({option.format(CURRENT)} NAME names one).')
     usable: dict[str, Series] = {}
@@ -120,13 +121,9 @@ def _single(values: FloatArray) -> FloatArray:
 
 def default(log: Log, quantity: str) -> list[Series]:
     """Return the default series; several if the choice is not clear."""
-    ranked = [one for one in _series_of(log, quantity) if one.rank is not None and one.n]
+    ranked = [one for one in log.of(quantity) if one.rank is not None and one.n]
     least = min((one.rank for one in ranked if one.rank is not None), default=None)
     return [one for one in ranked if one.rank == least]
-
-
-def _series_of(log: Log, quantity: str) -> list[Series]:
-    return [one for one in log.series if one.quantity == quantity]
 
 
 def _names_of(series: list[Series]) -> str:
@@ -144,7 +141,7 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
             raise InputError(f'{path} has several {quantity} series: {_names_of(found)}; choose '
                              f'with {option.format(quantity)} NAME, {_LIST}')
         return found[0] if found else None
-    held = [one for one in log.series if one.quantity in (quantity, ANY)]
+    held = log.of(quantity, ANY)
     for one in held:
         if one.name == name:
             return replace(one, quantity=quantity)
@@ -159,13 +156,13 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
 
 def _current(log: Log, voltage: Series) -> Series | None:
     """Return the current measured with a voltage, or the only current of a single battery."""
-    ranked = [one for one in _series_of(log, CURRENT) if one.rank is not None and one.n]
-    beside = [one for one in _series_of(log, CURRENT)
+    ranked = [one for one in log.of(CURRENT) if one.rank is not None and one.n]
+    beside = [one for one in log.of(CURRENT)
               if one.group and one.group == voltage.group and not one.silent]
     beside = [one for one in beside if one.rank is not None] or beside
     if beside:
         return beside[0]
-    batteries = [one for one in _series_of(log, VOLTAGE) if one.rank is not None]
+    batteries = [one for one in log.of(VOLTAGE) if one.rank is not None]
     return ranked[0] if len(ranked) == 1 and len(batteries) < 2 else None
 
 
@@ -173,7 +170,7 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
     """Return notes on other series that could be the voltage or the throttle."""
     notes: list[str] = []
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
-        others = [other for other in _series_of(log, quantity)
+        others = [other for other in log.of(quantity)
                   if not other.silent and (one is None or other.name != one.name)]
         # Prefer throttles that could be the default; list all voltages, rails included.
         ranked = [other for other in others if other.rank is not None]
@@ -205,11 +202,11 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None, signals: Sequ
             notes.append(f'{gyro.name} has no usable sample.')
     if IMU not in found and imu != NONE and log.format != 'csv':
         notes.append('The log holds no gyro, so there is no topic /imu.')
-    others = [one.name for one in log.inertial if IMU not in found or one.name != found[IMU].name]
+    others = [one.name for one in log.of(IMU) if IMU not in found or one.name != found[IMU].name]
     if others:
         notes.append(f"Also in the log: {', '.join(others)} (--imu NAME).")
-    if log.speeds is not None:
-        speeds, said = clean(log.speeds)
+    for one in log.of(SPEEDS):
+        speeds, said = clean(one)
         notes += prefixed(SPEEDS, said)
         if speeds.n:
             found[SPEEDS] = speeds
@@ -218,23 +215,19 @@ def choose_extras(path: Path, log: Log, *, imu: str | None = None, signals: Sequ
         notes += said
         if series.unit == UNKNOWN:
             notes.append(f'{name}: the log does not state its unit; written as it is logged.')
-        found[_unused_topic(topic_of(name), {*_TAKEN, *found})] = series
+        topic = topic_of(name)
+        free = chain((topic, f'signal/{topic}'), (f'signal/{topic}_{k}' for k in count(2)))
+        found[next(one for one in free if one not in {*_TAKEN, *found})] = series
     return found, tuple(notes)
-
-
-def default_gyro(log: Log) -> Series | None:
-    """Return the default series for /imu."""
-    return min((one for one in log.inertial if one.rank is not None and one.n),
-               key=lambda one: one.rank or 0, default=None)
 
 
 def signal_of(path: Path, log: Log, name: str) -> tuple[Series, tuple[str, ...]]:
     """Return the usable samples of a series by its name, and notes on it."""
     if not name:
         raise InputError('the name of the signal is empty: ' + _LIST)
-    found = next((one for one in log.series if one.name == name), None)
+    found = next((one for one in log.scalars if one.name == name), None)
     if found is None:
-        known = list(dict.fromkeys([*log.names, *(one.name for one in log.series)]))
+        known = list(dict.fromkeys([*log.names, *(one.name for one in log.scalars)]))
         hint = nearest(name, known) if known else 'it holds none'
         raise InputError(f"{path} has no series '{name}': "
                          + (_LIST if hint.startswith('valid:') else hint))
@@ -254,24 +247,15 @@ def topic_of(name: str) -> str:
                     ) or 'unnamed'
 
 
-def _unused_topic(topic: str, taken: set[str]) -> str:
-    if topic in taken:
-        topic = f'signal/{topic}'
-    number, free = 2, topic
-    while free in taken:
-        free, number = f'{topic}_{number}', number + 1
-    return free
-
-
 def _gyro(path: Path, log: Log, name: str | None) -> Series | None:
     """Return the gyro with this name; without a name, the default, if there is one."""
     if name is None or name == NONE:
-        return None if name else default_gyro(log)
-    known = [one.name for one in log.inertial]
+        return None if name else next(iter(default(log, IMU)), None)
+    known = {one.name: one for one in log.of(IMU)}
     if name not in known:
         raise InputError(f"{path} has no gyro '{name}': "
                          + (nearest(name, known) if known else 'it holds none'))
-    return log.inertial[known.index(name)]
+    return known[name]
 
 
 def gap_notes(t: FloatArray) -> tuple[str, ...]:

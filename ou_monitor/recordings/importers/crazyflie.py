@@ -24,7 +24,7 @@ from zlib import crc32
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Request, Series, SIGNAL,
+    CURRENT, DEGREE, GRAVITY, gyro_of, IMU, Log, log_of, Request, Series, SIGNAL,
     three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
@@ -78,7 +78,6 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: '
                      'they are not records of this log.')
     series: list[Series] = []
-    inertial: list[Series] = []
     for key, event in events.items():
         size = event.row.itemsize
         rows = np.frombuffer(b''.join(data[at:at + size] for at in found[key]), dtype=event.row)
@@ -87,8 +86,14 @@ def read(path: Path, request: Request) -> Log:
                    for k, name in enumerate(event.variables)}
         prefix = '' if event.name == _STEADY else f'{event.name}.'
         series += _series(prefix, t, columns)
-        inertial += _inertial(prefix, t, columns)
-    return log_of('crazyflie', series, {}, notes, (one.name for one in series), inertial)
+        rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'], factor)
+                         for group, factor in ((_GYRO, DEGREE), (_FORCE, GRAVITY)))
+        series += gyro_of(
+            f'{prefix}{_GYRO}', t, rates, forces,
+            f'{_GYRO} {DEGREE:.6g}' + ('' if forces is None else f', {_FORCE} {GRAVITY:g}'),
+            "gyro after the autopilot's filters", None if prefix else 0)
+    return log_of('crazyflie', series, {}, notes, (
+        one.name for one in series if one.quantity != IMU))
 
 
 def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int, _Event], int]:
@@ -153,12 +158,3 @@ def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Itera
             own, scale = _UNITS.get(name, (UNKNOWN, 1.0))
             yield Series(f'{prefix}{name}', SIGNAL, t, values * scale, f'{scale:.6g}',
                          'as logged' if own == UNKNOWN else name.partition('.')[0], own_unit=own)
-
-
-def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
-    rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'], factor)
-                     for group, factor in ((_GYRO, DEGREE), (_FORCE, GRAVITY)))
-    return gyro_of(
-        f'{prefix}{_GYRO}', t, rates, forces,
-        f'{_GYRO} {DEGREE:.6g}' + ('' if forces is None else f', {_FORCE} {GRAVITY:g}'),
-        "gyro after the autopilot's filters", None if prefix else 0)

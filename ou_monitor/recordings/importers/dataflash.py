@@ -107,10 +107,12 @@ def read(path: Path, request: Request) -> Log:
         raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
                          + ''.join(f': {note}' for note in notes))
+    names = (*(one.name for one in series), *names)
+    series += [*_gyros(table), *_speeds(table)]
     return log_of('dataflash_text' if text else 'dataflash', series,
                   _facts(banner) | _cells(parameters) | started(boot + min(
                       columns['t'][0] for columns in table.values()) if boot else 0.0), notes,
-                  (*(one.name for one in series), *names), _gyros(table), _speeds(table))
+                  names)
 
 
 def _name(kind: str, instance: str) -> str:
@@ -305,21 +307,21 @@ def _gyros(table: Table) -> Iterator[Series]:
         first.add(kind)
 
 
-def _speeds(table: Table) -> Series | None:
-    """Return the speeds that ESCs reported, at the stamps of the first one."""
+def _speeds(table: Table) -> Iterator[Series]:
+    """Yield the speeds that ESCs reported, at the stamps of the first one."""
     kind, field = SPEED
     found = {instance: columns for (name, instance), columns in table.items()
              if name == kind and np.any(columns.get(field, 0.0))}
     if not found:
-        return None
+        return
     t = next(iter(found.values()))['t']
     values = []
     for columns in found.values():
         # ESCs report in turn: the last report holds.
         last = np.maximum(np.searchsorted(columns['t'], t, 'right') - 1, 0)
         values.append(columns[field][last])
-    return speeds_of(t, values, RPM, 'rpm', 'speed reported by the ESC, the last report held',
-                     [instance or 0 for instance in found])
+    yield from speeds_of(t, values, RPM, 'rpm', 'speed reported by the ESC, the last report held',
+                         [instance or 0 for instance in found])
 
 
 def _throttle_scale(values: FloatArray) -> float:

@@ -180,7 +180,6 @@ def import_log(path: Path, request: Request) -> Log:
                           for one in log.series),
         facts=plain_texts(log.facts), notes=tuple(
             Note(printable(note), defect_of(note)) for note in log.notes),
-        inertial=tuple(replace(one, name=printable(one.name, 200)) for one in log.inertial),
         names=tuple(printable(name, 200) for name in log.names))
 
 

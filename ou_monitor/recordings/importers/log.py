@@ -107,13 +107,21 @@ class Log:
 
     # Name of the format.
     format: str  # noqa: A003
-    series: tuple[Series, ...]  # Candidates
+    # Candidates; gyros with accelerometers, and the speeds of the motors.
+    series: tuple[Series, ...]
     # Vehicle, firmware, number of the flight, as far as known.
     facts: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Dropped or unreadable parts, one sentence each
-    inertial: tuple[Series, ...] = ()  # Gyros and accelerometers
-    speeds: Series | None = None  # Speeds of the motors
     names: tuple[str, ...] = ()  # Names of all series of the file, unread ones included
+
+    def of(self, *quantities: str) -> list[Series]:
+        """Return the series of some quantities."""
+        return [one for one in self.series if one.quantity in quantities]
+
+    @property
+    def scalars(self) -> list[Series]:
+        """Return the series of one number over time."""
+        return [one for one in self.series if one.values.ndim == 1]
 
 
 def unusable_words(name: str, notes: Iterable[str]) -> str:
@@ -228,19 +236,12 @@ def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: Iterable[str],
-           names: Iterable[str], inertial: Iterable[Series] = (),
-           speeds: Series | None = None, start: float = math.inf) -> Log:
+           names: Iterable[str], start: float = math.inf) -> Log:
     """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
     # Corrupt bytes may give an early stamp: it counts only if others are near it.
     start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
-
-    def shifted(parts: Iterable[Series]) -> tuple[Series, ...]:
-        return tuple(replace(one, t=one.t - start) if math.isfinite(start) else one
-                     for one in parts)
-
-    return Log(form, shifted(series), facts, tuple(notes), shifted(inertial),
-               next(iter(shifted([speeds] if speeds else [])), None),
-               tuple(dict.fromkeys(names)))
+    return Log(form, tuple(replace(one, t=one.t - start) if math.isfinite(start) else one
+                           for one in series), facts, tuple(notes), tuple(dict.fromkeys(names)))
 
 
 def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
@@ -252,9 +253,9 @@ def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArr
 
 
 def speeds_of(t: FloatArray, rpm: Sequence[FloatArray], factor: float, scale: str, words: str,
-              numbers: Iterable[object]) -> Series:
-    """Return the speeds of motors by their numbers (factor to rad/s)."""
-    return Series(', '.join(f'motor_{number}' for number in numbers), SPEEDS, t,
+              numbers: Iterable[object]) -> Iterator[Series]:
+    """Yield the speeds of motors by their numbers (factor to rad/s)."""
+    yield Series(', '.join(f'motor_{number}' for number in numbers), SPEEDS, t,
                   np.column_stack(rpm) * factor, f'{scale} {factor:.6g}', words)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Progress, quiet, Request, RPM,
-    Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
+    Series, SIGNAL, SPEEDS, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
 from pyulog import ULog
@@ -136,8 +136,7 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'The logger lost data {counted(len(ulog.dropouts), "time")}, {lost:.3f} s '
                      'in all.')
     series: list[Series] = []
-    inertial: list[Series] = []
-    speeds: Series | None = None
+    motion: list[Series] = []
     for data in ulog.data_list:
         columns = {field: np.asarray(values, dtype=np.float64)
                    for field, values in data.data.items() if not field.startswith('_padding')}
@@ -146,11 +145,11 @@ def read(path: Path, request: Request) -> Log:
             found = list(_series(name, data.name, t, columns))
             series += [*found, *_other_fields(name, data.name, t, columns,
                                               {one.name for one in found})]
-            inertial += _gyros(name, data.name, t, columns)
-            speeds = speeds or _speeds(data.name, t, columns)
-    return log_of('ulog', series, _facts(ulog) | _started(ulog), notes,
-                  (*(one.name for one in series), *_declared(ulog)), inertial, speeds,
-                  ulog.start_timestamp * 1e-6)
+            motion += _gyros(name, data.name, t, columns)
+            if not any(one.quantity == SPEEDS for one in motion):
+                motion += _speeds(data.name, t, columns)
+    return log_of('ulog', [*series, *motion], _facts(ulog) | _started(ulog), notes,
+                  (*(one.name for one in series), *_declared(ulog)), ulog.start_timestamp * 1e-6)
 
 
 def _declared(ulog: Any) -> Iterator[str]:
@@ -186,13 +185,11 @@ def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[S
             yield from gyro_of(name, t, rates, forces, TURNED, words, rank)
 
 
-def _speeds(topic: str, t: FloatArray, columns: Columns) -> Series | None:
-    """Return the speeds reported by ESCs, or None."""
+def _speeds(topic: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     found = {k: np.abs(columns[f'esc[{k}].esc_rpm']) for k in range(16)
              if np.any(columns.get(f'esc[{k}].esc_rpm', 0.0))}
-    if topic != 'esc_status' or not found:
-        return None
-    return speeds_of(t, [*found.values()], RPM, 'rpm', 'speed reported by the ESC', found)
+    if topic == 'esc_status' and found:
+        yield from speeds_of(t, [*found.values()], RPM, 'rpm', 'speed reported by the ESC', found)
 
 
 def _facts(ulog: Any) -> dict[str, str]:

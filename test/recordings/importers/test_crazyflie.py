@@ -4,6 +4,7 @@ from made_logs import crazyflie, FIXED, hover, load
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.log import IMU
 from ou_monitor.recordings.read import read_beside, read_recording
 import pytest
 
@@ -22,7 +23,7 @@ def test_values_and_stamps(tmp_path, version, unit):
     np.testing.assert_array_equal(found['estTDOA.id'].values, np.arange(0, 300, 7))
     np.testing.assert_allclose(found['estTDOA.x'].t,
                                unit * (900 + 2000 * np.arange(0, 300, 7)), atol=1e-9)
-    gyro, = log.inertial
+    gyro, = log.of(IMU)
     np.testing.assert_allclose(gyro.values[:, :3], np.radians(table[:, 5:8]))
     np.testing.assert_allclose(gyro.values[:, 3:], 9.80665 * table[:, 8:11])
     assert (found['gyro.x'].unit, found['acc.z'].unit, found['pm.state'].unit) == (

@@ -8,7 +8,7 @@ from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import (
     choose_extras, gap_notes, topic_of)
-from ou_monitor.recordings.importers.log import clean, gyro_of, Log, Series
+from ou_monitor.recordings.importers.log import clean, gyro_of, IMU, Log, Series, SPEEDS
 from ou_monitor.recordings.read import read_signal
 import pytest
 
@@ -52,7 +52,7 @@ def test_a_gyro_without_scale_is_left_out(tmp_path):
     rows, _ = frames()
     path, log = load(tmp_path, blackbox(rows, FIELDS, {**HEADERS, 'gyro_scale': None,
                                                        'debug_mode': '3'}))
-    assert log.inertial == () and any('gyro_scale' in note for note in log.notes)
+    assert log.of(IMU) == [] and any('gyro_scale' in note for note in log.notes)
     assert any('no topic /imu' in note for note in choose_extras(path, log)[1])
     found = named(log)
     assert found['gyroADC[0]'].unit == '?'
@@ -66,7 +66,7 @@ def test_debug_fields_are_a_gyro_only_where_they_are(tmp_path, firmware, mode, s
     rows, moving = frames(100)
     headers = {**HEADERS, 'Firmware revision': firmware, 'debug_mode': mode}
     path, log = load(tmp_path, blackbox(rows, FIELDS, headers))
-    assert ('debug' in [one.name for one in log.inertial]) == shown
+    assert ('debug' in [one.name for one in log.of(IMU)]) == shown
     if shown:
         one = choose_extras(path, log, imu='debug')[0]['imu']
         np.testing.assert_allclose(one.values[:, :3], moving[:, 6:9] * DEGREE, rtol=1e-12)
@@ -77,13 +77,13 @@ def test_erpm_needs_the_poles(tmp_path):
     rows, moving = frames(100)
     speed = moving[:, 10:12] * 100.0 / 60.0 * 2.0 * np.pi
     _, log = load(tmp_path, blackbox(rows, FIELDS, HEADERS))
-    np.testing.assert_allclose(log.speeds.values, speed / 6.0, rtol=1e-12)
-    assert log.speeds.name == 'motor_0, motor_1' and '12 poles' in log.speeds.words
+    np.testing.assert_allclose(log.of(SPEEDS)[0].values, speed / 6.0, rtol=1e-12)
+    assert log.of(SPEEDS)[0].name == 'motor_0, motor_1' and '12 poles' in log.of(SPEEDS)[0].words
     content = blackbox(rows, FIELDS, {**HEADERS, 'motor_poles': None})
     _, log = load(tmp_path, content)
-    assert log.speeds is None and any('--poles' in note for note in log.notes)
+    assert log.of(SPEEDS) == [] and any('--poles' in note for note in log.notes)
     _, log = load(tmp_path, content, poles=14)
-    np.testing.assert_allclose(log.speeds.values, speed / 7.0, rtol=1e-12)
+    np.testing.assert_allclose(log.of(SPEEDS)[0].values, speed / 7.0, rtol=1e-12)
 
 
 COMBINED = [('uint64_t', 'timestamp'), ('float[3]', 'gyro_rad'),
@@ -135,7 +135,7 @@ def test_dataflash_states_units_and_holds_escs(tmp_path):
     np.testing.assert_allclose(series.values, values[1, :, 2], rtol=1e-6)
     assert series.unit == 'rad/s'
     # The second reports 3 ms later: its last report holds.
-    rpm = log.speeds.values * 30.0 / np.pi
+    rpm = log.of(SPEEDS)[0].values * 30.0 / np.pi
     np.testing.assert_allclose(rpm[5], [605.0, 1204.0], rtol=1e-6)
 
 
