@@ -24,15 +24,17 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
     ColumnBuffer, Definitions, FieldColumn, FieldReader, MessageTable)
 from ou_monitor.recordings.mcap_file import (
-    ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, SAMPLE_RATE, Span)
+    ABOUT, McapFile, moment, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.files import one_line, path_words, read_yaml
+from ou_monitor.stream.files import one_line, path_words, plain_texts, read_yaml
 from ou_monitor.text import printable, some
 import yaml
 
 FILE = 'metadata.yaml'
 _ROOT = 'rosbag2_bagfile_information'
+# Maximum bytes and values of the metadata (2000 topics).
+_MOST_BYTES, _MOST_NODES = 8_000_000, 200_000
 
 # rosbag2 writes the middleware's "for ever" as the largest duration.
 _FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
@@ -51,7 +53,7 @@ def read_metadata(folder: Path) -> tuple[list[Path], dict[str, str]]:
     """Return the MCAP files of a rosbag2 directory, in recorded order, and its custom data."""
     path = folder / FILE
     where = path_words(path)
-    content = read_yaml(path, 'the metadata', most_bytes=MOST_BYTES, most_nodes=MOST_NODES)
+    content = read_yaml(path, 'the metadata', most_bytes=_MOST_BYTES, most_nodes=_MOST_NODES)
     info = content.get(_ROOT) if isinstance(content, dict) else None
     if not isinstance(info, dict):
         raise InputError(f"{where} has no '{_ROOT}': it is not the metadata of a rosbag2")
@@ -70,7 +72,10 @@ def read_metadata(folder: Path) -> tuple[list[Path], dict[str, str]]:
         if not file.is_file():
             raise InputError(f"{where} names '{printable(file.name, 60)}', which is not in its "
                              'folder')
-    return files, custom_data(info)
+    custom = info.get('custom_data')
+    return files, plain_texts({
+        key: value for key, value in (custom if isinstance(custom, dict) else {}).items()
+        if isinstance(value, (str, int, float))})
 
 
 def is_part(file: Path, folder: Path) -> bool:

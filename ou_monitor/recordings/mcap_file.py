@@ -39,7 +39,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.cdr import gather, IntArray, joined, MessageTable
 from ou_monitor.recordings.importers.formats import kind_of_foreign, MAGIC
 from ou_monitor.records import Defect, Note
-from ou_monitor.stream.files import opened, parse_yaml, path_words, plain_texts
+from ou_monitor.stream.files import opened, path_words, plain_texts
 from ou_monitor.text import counted, printable
 import zstandard
 
@@ -64,13 +64,10 @@ _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
 # Key in a channel's metadata: rate of the samples within a block, Hz.
 SAMPLE_RATE = 'sample_rate_hz'
-# Metadata records on the origin of the recording: our own, and rosbag2's, which holds the text of
-# a metadata.yaml.  Maximum bytes and values of that text (2000 topics).
-ABOUT, ROSBAG2 = 'ou_monitor', 'rosbag2'
-MOST_BYTES, MOST_NODES = 8_000_000, 200_000
-# Maximum bytes of a metadata record (all together: twice that); maximum number of rosbag2's
-# records that are read (it writes two).
-_MOST_METADATA, _MOST_TABLES = 10_000_000, 3
+# Name of our own metadata record, on the origin of the recording.
+ABOUT = 'ou_monitor'
+# Maximum bytes of a metadata record (all together: twice that).
+_MOST_METADATA = 10_000_000
 # Maximum size of a definition (usual: some kB) and of a name (DDS: 256 characters).
 _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
 # Maximum number of damaged places before the walk ends, of left-out topics that are named, and of
@@ -164,7 +161,7 @@ class McapFile:
         # Definitions by number, including unused topics.
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._unpacked = self._tables = self._metadata = 0
+        self._unpacked = self._metadata = 0
         # Whether the summary counts the messages and lists the chunks, which are read later.
         self._trusted = False
         # One for all chunks, because creating it takes as long as unpacking a small chunk.
@@ -369,13 +366,6 @@ class McapFile:
             return
         if record.name == ABOUT:
             self.about |= plain_texts(record.metadata)
-        elif record.name == ROSBAG2 and self._tables < _MOST_TABLES:
-            self._tables += 1
-            # Ignore an unreadable table: the messages do not need it.
-            with suppress(InputError):
-                self.about |= custom_data(parse_yaml(
-                    record.metadata.get('serialized_metadata', ''), ROSBAG2,
-                    most_bytes=MOST_BYTES, most_nodes=MOST_NODES))
 
     def _add_channel(self, channel: Channel) -> None:
         if channel.id in self._channels:
@@ -563,17 +553,6 @@ def _rate(text: str) -> float | None:
         if 0.0 < (rate := float(text)) < math.inf:
             return rate
     return None
-
-
-def custom_data(content: Any) -> dict[str, str]:
-    """Return the custom data in the content of a metadata.yaml."""
-    info = content.get('rosbag2_bagfile_information', content) if isinstance(
-        content, dict) else None
-    custom = info.get('custom_data') if isinstance(info, dict) else None
-    if not isinstance(custom, dict):
-        return {}
-    return plain_texts({key: value for key, value in custom.items()
-                        if isinstance(value, (str, int, float))})
 
 
 def _frame(file: BinaryIO, at: int, size: int, in_data: bool) -> tuple[int, int]:

@@ -99,14 +99,6 @@ def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,
     except UnicodeDecodeError as error:
         raise InputError(f'{where} is not YAML that can be read: byte {error.start} is not '
                          'UTF-8') from error
-    return parse_yaml(text, where, most_bytes=most_bytes, most_nodes=most_nodes)
-
-
-def parse_yaml(text: str, where: str, *, most_bytes: int = MOST_BYTES,
-               most_nodes: int = MOST_NODES) -> Any:
-    """Return the content of a YAML text; raise InputError as `read_yaml` does."""
-    if len(text) > most_bytes:
-        raise InputError(f'{path_words(where)} holds more than {most_bytes / 1e6:g} MB')
     try:
         loader = _BoundedLoader(text, most_nodes)
         try:
@@ -117,7 +109,7 @@ def parse_yaml(text: str, where: str, *, most_bytes: int = MOST_BYTES,
         why = f'character {error.position} is not allowed in YAML'
     except yaml.MarkedYAMLError as error:
         why = _without_content(error)
-    raise InputError(f'{path_words(where)} is not YAML that can be read: {why}') from None
+    raise InputError(f'{where} is not YAML that can be read: {why}') from None
 
 
 @contextmanager

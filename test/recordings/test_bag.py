@@ -116,9 +116,11 @@ def test_several_files_are_one_bag(tmp_path):
     shutil.move(tmp_path / 'more.mcap', folder / 'bag_1.mcap')
     text = (folder / 'metadata.yaml').read_text()
     (folder / 'metadata.yaml').write_text(
-        text.replace('  - bag_0.mcap\n', '  - bag_0.mcap\n  - bag_1.mcap\n'))
+        text.replace('  - bag_0.mcap\n', '  - bag_0.mcap\n  - bag_1.mcap\n').replace(
+            'custom_data: null', 'custom_data: {a: [1], b: 2}'))
     reader = BagReader(folder)
-    assert reader.counts['/voltage'] == 2010
+    # Of the custom data, texts and numbers are taken.
+    assert reader.counts['/voltage'] == 2010 and reader.about == {'b': '2'}
     times = [m.log_time_ns for m in reader.raw_messages()]
     assert len(times) == 2030 and times == sorted(times)
     assert reader.end_ns == START + 2_008_000_000

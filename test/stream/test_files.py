@@ -8,7 +8,7 @@ from ou_monitor.recordings.bag import find_files
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.files import (
-    MOST_ALIASES, MOST_CHARACTERS, MOST_DIGITS, MOST_NODES, open_regular, parse_yaml)
+    MOST_ALIASES, MOST_CHARACTERS, MOST_DIGITS, MOST_NODES, open_regular, read_yaml)
 from ou_monitor.text import printable
 import pytest
 
@@ -105,10 +105,12 @@ def test_a_long_path_is_shortened(tmp_path):
     assert 'model.yaml is not YAML' in line and line.endswith('(line 1, column 5)')
 
 
-def test_honest_yaml_is_read():
+def test_honest_yaml_is_read(tmp_path):
     """Limits leave room: aliases, merge keys, depth, long numbers, a byte order mark."""
-    found = parse_yaml('base: &base {unit: V, list: &l [1, 2]}\none: {<<: *base, more: *l}\n'
-                       f'number: 1.{"3" * (MOST_DIGITS - 2)}\ndeep: {"[" * 50}{"]" * 50}\n', 'x')
+    path = tmp_path / 'x.yaml'
+    path.write_text('base: &base {unit: V, list: &l [1, 2]}\none: {<<: *base, more: *l}\n'
+                    f'number: 1.{"3" * (MOST_DIGITS - 2)}\ndeep: {"[" * 50}{"]" * 50}\n')
+    found = read_yaml(path, 'x')
     assert found['one'] == {'unit': 'V', 'list': [1, 2], 'more': [1, 2]}
     assert found['number'] == pytest.approx(4.0 / 3.0)
 
