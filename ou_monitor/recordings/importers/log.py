@@ -240,8 +240,9 @@ def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: It
     """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
     # Corrupt bytes may give an early stamp: it counts only if others are near it.
     start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
-    return Log(form, tuple(replace(one, t=one.t - start) if math.isfinite(start) else one
-                           for one in series), facts, tuple(notes), tuple(dict.fromkeys(names)))
+    return Log(form, tuple(
+        replace(one, t=one.t - start) if math.isfinite(start) else one for one in series),
+        facts, tuple(notes), tuple(dict.fromkeys(names)))
 
 
 def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
@@ -256,7 +257,7 @@ def speeds_of(t: FloatArray, rpm: Sequence[FloatArray], factor: float, scale: st
               numbers: Iterable[object]) -> Iterator[Series]:
     """Yield the speeds of motors by their numbers (factor to rad/s)."""
     yield Series(', '.join(f'motor_{number}' for number in numbers), SPEEDS, t,
-                  np.column_stack(rpm) * factor, f'{scale} {factor:.6g}', words)
+                 np.column_stack(rpm) * factor, f'{scale} {factor:.6g}', words)
 
 
 def started(unix: float) -> dict[str, str]:
