@@ -65,6 +65,9 @@ class Samples:
     # Caches: columns by term; the last design (voltage, level, columns) by terms.
     _known: dict[Term, FloatArray] = field(default_factory=dict, init=False)
     designs: dict[tuple[Term, ...], FloatArray] = field(default_factory=dict, init=False)
+    # Factors on alpha, sigma and the white noise by the terms of `Role.DRIVE` that cause them.
+    factors: dict[tuple[Term, ...], tuple[FloatArray, FloatArray, FloatArray]] = field(
+        default_factory=dict, init=False)
 
     @property
     def n(self) -> int:

@@ -39,7 +39,7 @@ _MANY = 4
 _SETTLES = 1024
 # Convergence tolerances of a full and of a rough fit: gain of a step, nats.
 _SETTLED, _NEARLY = 0.02, 0.5
-_RNG = np.random.default_rng(0)
+_KEPT = 8  # Number of models whose factors are kept: a fit moves one parameter at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,10 +214,18 @@ def driven(samples: Samples, terms: Sequence[Term]) -> Segment:
     ou = terms[0]
     assert isinstance(ou, OU)
     s = samples.segment(ou.alpha, ou.sigma)
-    for term in terms:
-        if term.ROLE is Role.DRIVE:
-            term.start(_RNG)(s)
-    return s
+    drives = tuple(term for term in terms if term.ROLE is Role.DRIVE)
+    if not drives:
+        return s
+    if drives not in samples.factors:
+        if len(samples.factors) >= _KEPT:
+            samples.factors.clear()
+        unit = samples.segment(1.0, 1.0)
+        for term in drives:
+            term.start(np.random.default_rng(0))(unit)
+        samples.factors[drives] = unit.alpha, unit.sigma, unit.noise
+    alpha, sigma, noise = samples.factors[drives]
+    return replace(s, alpha=ou.alpha * alpha, sigma=ou.sigma * sigma, noise=noise)
 
 
 def white_noise(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:

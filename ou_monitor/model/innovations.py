@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from scipy.linalg.lapack import dpbtrf, dtbtrs
+from scipy.linalg.lapack import dpbtrf, dpttrf, dtbtrs
 from scipy.signal import lfilter
 
 
@@ -112,11 +112,14 @@ class Filter:
         """Return innovations and filtered states of samples with their own gain."""
         n, p = columns.shape
         d = self._gain.shape[1]
-        right = (self._gain[:, :, None] * columns[:, None, :]).reshape(n * d, p)
-        state = dtbtrs(self._band_of_loop, right, uplo='L', diag='U')[0].reshape(n, d, p)
-        e = columns.astype(np.float64)
-        e[1:] -= (self._look[1:, :, None] * state[:-1]).sum(axis=1)
-        return e, state
+        # Series by series, as LAPACK stores them.
+        rows = np.ascontiguousarray(columns.T, dtype=np.float64)
+        right = (rows[:, :, None] * self._gain).reshape(p, n * d).T
+        state = dtbtrs(self._band_of_loop, right, uplo='L', diag='U', overwrite_b=1)[0]
+        state = state.T.reshape(p, n, d)
+        e = rows.copy()
+        e[:, 1:] -= np.einsum('pnd,nd->pn', state[:, :-1], self._look[1:])
+        return e.T, state.transpose(1, 2, 0)
 
 
 # Maximum condition number of the eigenvectors; beyond it, the loop is disturbed by this share.
@@ -195,8 +198,6 @@ def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out:
 def _inverse(a: FloatArray) -> FloatArray:
     """Invert matrices, shape (d, d, n), by Cholesky factors; NaN if not positive definite."""
     d = a.shape[0]
-    if d == 1:
-        return 1.0 / a
     some = _pattern(a)
     # Lower factor, and its inverse by forward substitution.
     low: dict[tuple[int, int], FloatArray] = {}
@@ -234,11 +235,22 @@ def _inverse(a: FloatArray) -> FloatArray:
 
 # Approximate number of matrix elements processed at once; limits memory.
 _ELEMENTS = 2e6
+_SINGULAR = 'the covariance of the model is singular or not finite'
 
 
 def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> FloatArray:
     """Return filtered covariances, shape (d, d, n); the first q is the prior covariance."""
     d, n = f.shape[0], f.shape[2]
+    if d == 1:
+        # For a single state the matrix is tridiagonal, which takes a quarter of the time.
+        with np.errstate(over='ignore', invalid='ignore'):
+            precision = 1.0 / q[0, 0]
+            back = np.append((f[0, 0] * f[0, 0] * precision)[1:], 0.0)
+            pivots, _, info = dpttrf(
+                precision + h[0] * h[0] / r + back, -(precision * f[0, 0])[1:])
+        if info != 0 or not np.isfinite(pivots).all():
+            raise ValueError(_SINGULAR)
+        return np.asarray(1.0 / (pivots - back))[None, None]
     turns = _pattern(f)
     weight = _inverse(q)
     known = _pattern(weight)
@@ -256,7 +268,7 @@ def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> Flo
     factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
     del band
     if info != 0 or not np.isfinite(factor[0]).all():
-        raise ValueError('the covariance of the model is singular or not finite')
+        raise ValueError(_SINGULAR)
     p = _pivots(factor, n, d)
     p -= back
     del factor, back

@@ -30,6 +30,9 @@ _MEDIAN = 0.6745
 # Filter gain that counts as 1; level, in standard deviations of an innovation, below which it
 # counts as 0.
 _ALL, NO_LEVEL = 0.98, 0.2
+# Maximum number of times that states and the filter's response to them are computed in turn, and
+# change of the response, in standard deviations of an innovation, at which they agree.
+_TURNS, _SETTLED = 30, 1e-6
 
 
 def rates_between(up: float, down: float, states: int) -> FloatArray:
@@ -92,40 +95,23 @@ class Scores:
         """Return the scores with `followed` computed for a chain with coordinates x."""
         if abs(x[2]) < NO_LEVEL or bool((self.trust == 1.0).all()):
             return self.at_once
-        chances = step_chances(x, self.step, states)
-        law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
-        middle = float(law @ np.arange(states))
-        std = np.exp(x[4] + x[3] * np.arange(states))
-        # Residual of a score for each pair of states, while `followed` is zero.
-        direct = _direct(self, at_once, middle, states)
-        height = x[2] * self.unit
-        pairs = list(np.ndindex(states, states))
-        rows = np.array([self.z - height * direct[pair] for pair in pairs])
         kept, drawn = self.phi * (1.0 - self.trust), self.phi * self.trust
-        columns = zip(rows.T.tolist(), height.tolist(), kept.tolist(), drawn.tolist(),
-                      self.phi.tolist())
-        weights, scales = (chances / std).ravel().tolist(), (-0.5 / std**2).tolist()
-        exp, found, before = math.exp, [], law.tolist()
-        followed = moved = 0.0
-        for off, high, keep, draw, slow in columns:
+        found = replace(self, followed=np.zeros(self.z.size))
+        for _ in range(_TURNS):
+            # The states known so far follow from `followed`, and `followed` from these states.
+            chain = chain_of(found, x, at_once, states)[0]
+            known = (forward(*chain)[0] - chain[2]) @ np.arange(states)
             # With at_once the filter follows the level, otherwise the rail, which lags the level.
-            behind = keep * (followed if at_once else followed - moved)
-            found.append(behind)
-            more = high * behind
-            known = sum(p * s for s, p in enumerate(before)) - middle
-            tops = [0.0] * states
-            for m, (i, j) in enumerate(pairs):
-                d = off[m] + more
-                tops[j] += before[i] * weights[m] * exp(scales[j] * d * d)
-            total = sum(tops)
-            # If no state explains the sample, start again from the stationary law.
-            before = [p / total for p in tops] if total > 0.0 else law.tolist()
-            if at_once:
-                followed = keep * followed + draw * known
-            else:
-                followed = keep * followed + draw * moved
-                moved = slow * moved + (1.0 - slow) * known
-        return replace(self, followed=np.array(found))
+            moved = np.append(0.0, first_order(
+                self.phi, (1.0 - self.phi) * known, 0.0)[:-1])
+            behind = np.append(0.0, first_order(
+                kept, drawn * (known if at_once else moved), 0.0)[:-1])
+            followed = kept * (behind if at_once else behind - moved)
+            change = float(np.abs(x[2] * self.unit * (followed - found.followed)).max())
+            found = replace(self, followed=followed)
+            if change < _SETTLED:
+                break
+        return found
 
 
 def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray:

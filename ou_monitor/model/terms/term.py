@@ -223,7 +223,7 @@ class Role(enum.Enum):
     EXACT = enum.auto()
     # A sum of known columns with coefficients.
     MEAN = enum.auto()
-    # Changes alpha, sigma or the white noise with a measured input.
+    # Multiplies alpha, sigma or the white noise by a factor that follows a measured input.
     DRIVE = enum.auto()
     # Adds states to the linear system.
     BLOCK = enum.auto()
