@@ -263,7 +263,7 @@ class FilterSettings:
     def from_options(cls, options: Mapping[str, object],
                      base: FilterSettings | None = None) -> FilterSettings:
         """Return settings with options changed; `fallback`, if omitted, moves into fmin..fmax."""
-        values = _known(options, cls, 'filter option')
+        values = _known(options, [one.name for one in fields(cls)], 'filter option')
         old = base or cls()
         if 'fallback' not in values:
             try:
@@ -283,17 +283,12 @@ FILTER_PARAMETERS = parameters_of(FilterSettings)
 
 def monitor_settings(values: Mapping[str, object]) -> MonitorSettings:
     """Return settings from dotted parameter names."""
-    known = [parameter.name for parameter in ESTIMATOR_PARAMETERS]
-    for name in values:
-        if name not in known:
-            raise ValueError(f"unknown parameter '{name}': {nearest(name, known)}")
-    return MonitorSettings(**{  # type: ignore[arg-type]
-        name.replace('.', '_'): value for name, value in values.items()})
+    known = _known(values, [one.name for one in ESTIMATOR_PARAMETERS], 'parameter')
+    return MonitorSettings(**{name.replace('.', '_'): value for name, value in known.items()})
 
 
-def _known(options: Mapping[str, object], settings: type[Any], what: str) -> dict[str, Any]:
-    """Return options; `ValueError` if one is not a field of the settings."""
-    known = [one.name for one in fields(settings)]
+def _known(options: Mapping[str, object], known: list[str], what: str) -> dict[str, Any]:
+    """Return options; `ValueError` if a name is not known."""
     for name in options:
         if name not in known:
             raise ValueError(f"unknown {what} '{name}': {nearest(name, known)}")
@@ -380,7 +375,8 @@ class NotchSettings:
     def from_options(cls, options: Mapping[str, object],
                      base: NotchSettings | None = None) -> NotchSettings:
         """Return settings with the given options changed."""
-        return replace(base or cls(), **_known(options, cls, 'notch option'))
+        names = [one.name for one in fields(cls)]
+        return replace(base or cls(), **_known(options, names, 'notch option'))
 
 
 # In the node, notches are off by default.

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import enum
 import functools
 import math
-from typing import Protocol
 
 import numpy as np
 from ou_monitor.model import arma
@@ -143,29 +142,17 @@ class _Point:
     gram: FloatArray
 
 
-class _Likelihood(Protocol):
-    """A restricted likelihood, profiled over scale and mean."""
-
-    n: int  # Number of samples, or block means
-    m: int  # Raw samples in each block
-    step: float  # Mean step, s
-    low: FloatArray  # Lower and upper limits of ln a and z
-    high: FloatArray
-
-    def at(self, log_a: float, z: float, used: int) -> _Point:
-        """Return the likelihood with the first `used` regressors."""
-
-    def start(self, used: int) -> FloatArray:
-        """Return ln a and z from which a search may start."""
-
-
 def _ends(n: int) -> tuple[FloatArray, FloatArray]:
     """Return limits of ln a and z: from a relaxation time of ten windows to no correlation."""
     return np.array([math.log(0.1 / (n - 1)), 0.0]), np.array([math.log(2.0 * _FASTEST), _LOUDEST])
 
 
 class SpectralLikelihood:
-    """Whittle likelihood of evenly spaced samples, or means of m; last row: the voltage, V."""
+    """
+    Whittle likelihood of evenly spaced samples, or means of m; last row: the voltage, V.
+
+    It is restricted, and profiled over scale and mean; low, high: limits of ln a and z.
+    """
 
     def __init__(self, rows: FloatArray, lengths: list[int], step: float, m: int = 1) -> None:
         self.n, self.m, self.step = rows.shape[1], m, step
@@ -272,6 +259,9 @@ class StampLikelihood:
         return maximise(even, used).place
 
 
+Likelihood = SpectralLikelihood | StampLikelihood
+
+
 def noise_scale(share: float) -> float:
     """Return z of white noise / (sigma^2 mean step): linear for small values, then logarithmic."""
     return math.log1p(share / _SMALL)
@@ -345,7 +335,7 @@ class Maximum:
     curved: FloatArray | None
 
 
-def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) -> Maximum:
+def maximise(likelihood: Likelihood, used: int, before: Maximum | None = None) -> Maximum:
     """Fit rate, noise and a mean of `used` regressors (before: fit of a nearly equal window)."""
     low, high = likelihood.low, likelihood.high
     place, at, curved = _minimised(
@@ -458,7 +448,7 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
     variance = float(left @ left) / t.size
     rounding = _EXACT * float(np.mean((y - y[0]) ** 2))
     exact, held, trend = False, m, False
-    likelihood: _Likelihood = _spectral(t, rows, m)
+    likelihood: Likelihood = _spectral(t, rows, m)
     found: Maximum | None = None
     again: Maximum | None = None
     if variance > rounding and _correlated(left):

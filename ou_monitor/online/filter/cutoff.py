@@ -34,7 +34,6 @@ The cutoff in force is always within fmin..fmax, even if 0.45 of the sample rate
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import enum
 from functools import cache
 import math
@@ -114,31 +113,22 @@ def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, interval
     """Return the law's cutoff, Hz, NaN if sigma is unknown (V/sqrt(s), 1/s, interval in s)."""
     if not (math.isfinite(sigma) and sigma >= 0.0):
         return NAN
-    rate = alpha if 1e-6 <= alpha <= 1e9 else settings.alpha
-    wanted = LAWS[settings.law](settings, sigma, rate, interval)
-    return min(max(wanted, settings.lowest), settings.fmax)
-
-
-def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
-                  interval: float) -> float:
-    """Return fmax for sigma up to `sigma_ref`, else the lowest cutoff (the paper, section 6)."""
-    return settings.fmax if sigma <= settings.sigma_ref else settings.lowest
-
-
-def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
-                       interval: float) -> float:
-    """Return the cutoff at which the rms of the output noise has the wanted value."""
-    # Without `coupling`, the noise is taken as white, with a variance proportional to sigma^2.
-    # The default of the wanted rms is the rms at `sigma_ref` and fmax.
-    if settings.coupling:
-        wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
-            supply_noise(settings.mode, settings.order, settings.fmax, alpha))
-        return cutoff_for_noise(settings.mode, settings.order, wanted,
-                                settings.coupling * sigma, alpha)
-    if sigma <= settings.sigma_ref:
-        return settings.fmax
-    return relative_cutoff(settings.mode, settings.order, settings.fmax,
-                           sigma / settings.sigma_ref, interval)
+    s = settings
+    if s.law == 'threshold':
+        # The paper, section 6.
+        return s.fmax if sigma <= s.sigma_ref else s.lowest
+    # Law constant_noise: the cutoff at which the rms of the output noise has the wanted value, by
+    # default the rms at `sigma_ref` and fmax.  Without `coupling`, the noise is taken as white,
+    # with a variance proportional to sigma^2.  (`lowpass` has the law kalman.)
+    if s.coupling:
+        rate = alpha if 1e-6 <= alpha <= 1e9 else s.alpha
+        rms = s.noise_wanted or s.coupling * s.sigma_ref * math.sqrt(
+            supply_noise(s.mode, s.order, s.fmax, rate))
+        wanted = cutoff_for_noise(s.mode, s.order, rms, s.coupling * sigma, rate)
+    else:
+        wanted = s.fmax if sigma <= s.sigma_ref else relative_cutoff(
+            s.mode, s.order, s.fmax, sigma / s.sigma_ref, interval)
+    return min(max(wanted, s.lowest), s.fmax)
 
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
@@ -188,13 +178,6 @@ def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
         else:
             high = middle
     return math.exp(low)
-
-
-# The law `kalman` has no cutoff of its own: see `lowpass`.
-LAWS: dict[str, Callable[[FilterSettings, float, float, float], float]] = {
-    'constant_noise': constant_noise_law,
-    'threshold': threshold_law,
-}
 
 
 # Convergence tolerance, in ln(cutoff).

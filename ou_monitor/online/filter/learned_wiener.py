@@ -164,13 +164,6 @@ class LearnedWiener:
         # Maximum factor on the stated noise.
         self._most = _LARGEST if self._slope else 1.0
 
-    def __copy__(self) -> LearnedWiener:
-        """Return an independent copy."""
-        other = object.__new__(LearnedWiener)
-        other.__dict__.update(self.__dict__)
-        other._state, other._rows = self._state.copy(), self._rows.copy()
-        return other
-
     def configure(self, settings: FilterSettings) -> None:
         """Change settings; keep the estimate."""
         self._settings = settings

@@ -16,7 +16,6 @@ the sampling, before the filter.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 import math
 
@@ -91,8 +90,6 @@ class AdaptiveLowPass:
         self._kalman: LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
-        # Copy of `_kalman` with the parameters before a change, kept until the next sample.
-        self._before: LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
         self._t: float | None = None
@@ -183,9 +180,8 @@ class AdaptiveLowPass:
         self._control.configure(settings)
         self._law_inputs = None
         if settings.law != 'kalman':
-            self._kalman, self._before, self._known = None, None, False
+            self._kalman, self._known = None, False
         elif self._kalman is not None:
-            self._before = copy(self._kalman)
             self._kalman.configure(settings)
         if self._t is not None:
             self._offset = self._out - self._source()
@@ -316,14 +312,9 @@ class AdaptiveLowPass:
         if known:
             self._sigma = sigma
         rate = alpha if 1e-6 <= alpha <= 1e9 else self._settings.alpha
-        sample = (dt, interval, x, (x - self._x) / dt, self._sigma, error, rate)
-        self._kalman.advance(*sample)
+        self._kalman.advance(dt, interval, x, (x - self._x) / dt, self._sigma, error, rate)
         if begun:
             self._offset = self._out - self._kalman.y
-        elif self._before is not None:
-            # Continue from the output that the old parameters would have given.
-            self._offset += self._before.advance(*sample) - self._kalman.y
-        self._before = None
         if known != self._known:
             self._known = known
             self._offset += self._state.y - self._kalman.y if known else (

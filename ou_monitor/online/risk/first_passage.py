@@ -104,26 +104,38 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
 def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float | None = None,
             noise_std: float = 0.0) -> FloatArray:
     """Return P(the continuous path goes below `voltage`, V, of any shape, within `horizon`, s)."""
-    return _Paths(supply, now, noise_std, *_MANY).risk(voltage, horizon)
+    return Passage(supply, now, noise_std, _MANY).risk(voltage, horizon)
 
 
-class _Paths:
-    """Start and parameters of the path at quadrature nodes over their errors."""
+class Passage:
+    """Distribution of the lowest voltage from now on, V, by quadrature over errors."""
 
-    def __init__(self, supply: Supply, now: float | None, noise_std: float, grid: FloatArray,
-                 weights: FloatArray) -> None:
-        u0, ln_alpha, ln_sigma, weight = _nodes(supply, grid, weights)
+    def __init__(self, supply: Supply, now: float | None, noise_std: float,
+                 nodes: tuple[FloatArray, FloatArray] | None = None) -> None:
+        grid, weight = nodes or _FEW
+        self._half = max(noise_std, 0.1 * math.exp(
+            supply.ln_sigma - 0.5 * supply.ln_alpha) / math.sqrt(2.0))
+        self._now = -math.inf if now is None else now
+        # One axis is ln Var_inf = 2 ln sigma - ln alpha, another is ln alpha given ln Var_inf.
+        alpha_variance = supply.ln_alpha_se**2
+        variance = max(
+            4.0 * supply.ln_sigma_se**2 + alpha_variance - 4.0 * supply.covariance, 0.0)
+        shared = (2.0 * supply.covariance - alpha_variance) / variance if variance else 0.0
+        by_variance = math.sqrt(variance) * grid[0]
+        more_alpha = shared * by_variance + math.sqrt(
+            max(alpha_variance - shared**2 * variance, 0.0)) * grid[1]
+        u0 = supply.u0 + supply.u0_se * grid[2]
+        ln_alpha = supply.ln_alpha + more_alpha
+        ln_sigma = supply.ln_sigma + 0.5 * (by_variance + more_alpha)
         sd, alpha = np.exp(ln_sigma - 0.5 * ln_alpha) / math.sqrt(2.0), np.exp(ln_alpha)
         start = np.zeros_like(u0) if now is None else (u0 - now) / sd
         if now is not None and noise_std > 0.0:
             # Distribution of the present voltage, given one noisy reading.
             keep = 1.0 / (1.0 + (noise_std / sd) ** 2)
-            nodes, shares = _hermite(_START_NODES)
-            u0, sd, alpha = (np.repeat(x, nodes.size, axis=-1) for x in (u0, sd, alpha))
-            shape = u0.shape
-            start = ((keep * start)[..., None] + np.sqrt(1.0 - keep)[..., None] * nodes).reshape(
-                shape)
-            weight = (weight[..., None] * shares).reshape(shape)
+            points, shares = _hermite(_START_NODES)
+            u0, sd, alpha = (np.repeat(x, points.size) for x in (u0, sd, alpha))
+            start = ((keep * start)[:, None] + np.sqrt(1.0 - keep)[:, None] * points).ravel()
+            weight = (weight[:, None] * shares).ravel()
         self._u0, self._sd, self._alpha, self._start, self._weight = u0, sd, alpha, start, weight
 
     def risk(self, voltage: npt.ArrayLike, horizon: float) -> FloatArray:
@@ -133,47 +145,11 @@ class _Paths:
             self._start, barrier, self._alpha * horizon)
         return np.clip(chance.sum(axis=-1), 0.0, 1.0)
 
-
-@dataclass(frozen=True)
-class Passage:
-    """Distribution of the lowest voltage, V, within a horizon from one instant on."""
-
-    supply: Supply
-    now: float
-    noise_std: float
-
-    @functools.cached_property
-    def _paths(self) -> _Paths:
-        return _Paths(self.supply, self.now, self.noise_std, *_FEW)
-
     def density(self, low: float, horizon: float) -> float:
         """Return the density, 1/V, at a lowest voltage, averaged over the width of the noise."""
-        sd = math.exp(float(np.asarray(self.supply.ln_sigma)) - 0.5 * float(
-            np.asarray(self.supply.ln_alpha))) / math.sqrt(2.0)
-        half = max(self.noise_std, 0.1 * sd)
-        levels = np.array([low + half, low - half])
-        above, below = np.where(
-            levels >= self.now, 1.0, self._paths.risk(levels, horizon)).tolist()
-        return float((above - below) / (2.0 * half))
-
-
-def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray
-           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return levels, ln alpha, ln sigma at the nodes (last axis), and their weights."""
-    u0, u0_se, ln_alpha, ln_alpha_se, ln_sigma, ln_sigma_se, covariance = (
-        np.asarray(value, dtype=np.float64)[..., None] for value in (
-            supply.u0, supply.u0_se, supply.ln_alpha, supply.ln_alpha_se, supply.ln_sigma,
-            supply.ln_sigma_se, supply.covariance))
-    # One axis is ln Var_inf = 2 ln sigma - ln alpha, another is ln alpha given ln Var_inf.
-    variance = np.maximum(4.0 * ln_sigma_se**2 + ln_alpha_se**2 - 4.0 * covariance, 0.0)
-    shared = np.divide(2.0 * covariance - ln_alpha_se**2, variance, out=np.zeros_like(variance),
-                       where=variance > 0.0)
-    left = np.sqrt(np.maximum(ln_alpha_se**2 - shared**2 * variance, 0.0))
-    by_variance = np.sqrt(variance) * grid[0]
-    more_alpha = shared * by_variance + left * grid[1]
-    more_sigma = 0.5 * (by_variance + more_alpha)
-    return (u0 + u0_se * grid[2], ln_alpha + more_alpha, ln_sigma + more_sigma,
-            np.broadcast_to(weights, np.broadcast_shapes(u0.shape, weights.shape)))
+        levels = np.array([low + self._half, low - self._half])
+        above, below = np.where(levels >= self._now, 1.0, self.risk(levels, horizon)).tolist()
+        return float((above - below) / (2.0 * self._half))
 
 
 def _error(value: float) -> float:

@@ -175,10 +175,6 @@ class FloorWatch:
         first = max(int(begin[-1]), t.size - _MOST)
         self._t, self._v = t[first:], v[first:]
 
-    def __len__(self) -> int:
-        """Return the number of samples kept."""
-        return int(self._t.size)
-
     def take(self, arriving: bool = True) -> bool:
         """Return whether the voltage was low since the last call, or is now (if `arriving`)."""
         low, self._was_low = self._was_low or (self._low and arriving), False
@@ -295,7 +291,8 @@ class BrownoutFlag:
             self._enter(level)
         if known or low:
             self._known = self._now
-        flag = self._flag(known)
+        flag = True if level is FlagLevel.CRITICAL else (
+            False if known and level is not FlagLevel.UNKNOWN else None)
         if self._doubt and level is not FlagLevel.CRITICAL:
             level, flag, reason = FlagLevel.UNKNOWN, None, self._doubt
         self._state = FlagState(level, flag, self._since, reason, self._now - self._since, low,
@@ -318,11 +315,6 @@ class BrownoutFlag:
 
     def _enter(self, level: FlagLevel) -> None:
         self._level, self._since = level, self._now
-
-    def _flag(self, known: bool) -> bool | None:
-        if self._level is FlagLevel.CRITICAL:
-            return True
-        return False if known and self._level is not FlagLevel.UNKNOWN else None
 
     def _wanted(self, risk: float, soon: float, tight: bool, known: bool, low: bool
                 ) -> tuple[FlagLevel, str]:

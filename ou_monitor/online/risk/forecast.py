@@ -99,29 +99,21 @@ def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) ->
     return np.asarray(np.maximum(first, missed))
 
 
-class LowestLaw:
-    """
-    Law of the lowest voltage.
-
-    values: bias b0, gain b1, variances k0 to k2, and covariance of b0 and b1 (3 values).
-    """
-
-    def __init__(self, values: FloatArray) -> None:
-        self.values = values
-
-    def moments(self, parts: Sequence[FloatArray], start: float
-                ) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation, V, with errors of the law; parts: from `lowest`."""
-        mean, noise, error, brief = parts
-        bias, gain, k0, k1, k2, c00, c01, c11 = self.values.tolist()
-        x = mean - start
-        return start + bias * noise + gain * x, np.sqrt(
-            (k0 + c00) * noise * noise + 2.0 * c01 * noise * x + (k1 * brief + c11) * x * x
-            + k2 * error * error)
+def moments(law: FloatArray, parts: Sequence[FloatArray], start: float
+            ) -> tuple[FloatArray, FloatArray]:
+    """Return mean and deviation of the lowest voltage, V, errors of the law included."""
+    # law: bias b0, gain b1, variances k0 to k2, and covariance of b0 and b1 (3 values); parts:
+    # from `lowest`.
+    mean, noise, error, brief = parts
+    bias, gain, k0, k1, k2, c00, c01, c11 = law.tolist()
+    x = mean - start
+    return start + bias * noise + gain * x, np.sqrt(
+        (k0 + c00) * noise * noise + 2.0 * c01 * noise * x + (k1 * brief + c11) * x * x
+        + k2 * error * error)
 
 
 class Calibrator:
-    """Learns a `LowestLaw` from completed horizons."""
+    """Learns a law of the lowest voltage (see `moments`) from completed horizons."""
 
     def __init__(self) -> None:
         # Normal equations of the regression of the fall on noise and predicted fall.
@@ -137,8 +129,7 @@ class Calibrator:
         whole = a * b - both * both
         self._b = (b * first - both * second) / whole, (a * second - both * first) / whole
         self._variance = (_PRIOR * _VARIANCES + self._squares) / (_PRIOR + self._count)
-        self.law = LowestLaw(np.array([*self._b, *self._variance, b / whole, -both / whole,
-                                       a / whole]))
+        self.law = np.array([*self._b, *self._variance, b / whole, -both / whole, a / whole])
 
     def add(self, low: float, predicted: Sequence[float], start: float, weight: float,
             elapsed: float) -> None:
@@ -256,7 +247,7 @@ class _HorizonLaws:
     @property
     def values(self) -> FloatArray:
         """Return the values that are interpolated between horizons."""
-        return np.append(self.calibrator.law.values, (
+        return np.append(self.calibrator.law, (
             self.held.value, *self.held.misses, self.passage.value))
 
     def learn(self, begun: _PendingHorizon, low: float, peak: float, dwell: float,
@@ -275,7 +266,7 @@ class _HorizonLaws:
             parts = lowest(
                 begun.state, courses.after(held(peak, dwell, begun.state.throttle)), self.horizon,
                 sampling)
-            middle, spread = law.moments(parts, start)
+            middle, spread = moments(law, parts, start)
             found = density(y, middle, spread)
             wide = density(y, middle[:1], _wider(spread[:1], begun.deviation, self.held.misses))
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
@@ -329,7 +320,7 @@ class Forecast:
         self._samples = 0
         self._begun = NAN
         self._next = -math.inf
-        self._laws: dict[float, tuple[LowestLaw, float, float, float, float]] = {}
+        self._laws: dict[float, tuple[FloatArray, float, float, float, float]] = {}
         self._kept_drops: dict[float, tuple[float, float]] = {}
         self._kept_flown: dict[float, FlownHorizons] = {}
         self._kept_state: LoadState | None = None
@@ -460,12 +451,12 @@ class Forecast:
             self._kept_flown[horizon] = flown(self._past, horizon)
         return self._kept_flown[horizon]
 
-    def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float]:
+    def _learned(self, horizon: float) -> tuple[FloatArray, float, float, float, float]:
         """Return the law, its `held` share and misses (two values), and first passage's share."""
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
-            self._laws[horizon] = (LowestLaw(values[:8]), *values[8:].tolist())
+            self._laws[horizon] = (values[:8], *values[8:].tolist())
         return self._laws[horizon]
 
     def risk(self, voltage: float, horizon: float) -> Outcome:
@@ -482,8 +473,8 @@ class Forecast:
             courses, shares = pilot(self._flown(horizon), state.throttle, horizon)
             # At idle, at the present throttle, and with the pilot's future throttle.
             every = courses.after(held([0.0, state.throttle], horizon, state.throttle))
-            each = below(voltage, *law.moments(lowest(state, every, horizon, self._sampling),
-                                               mean_now(state)))
+            each = below(voltage, *moments(
+                law, lowest(state, every, horizon, self._sampling), mean_now(state)))
             parts = each.item(0), each.item(1), float(shares @ each[2:])
             risk, basis = _HALF * far + (1.0 - _HALF) * parts[2], 'load'
             cause = DOMINANT[int(np.argmax(np.diff(np.maximum.accumulate(
@@ -542,7 +533,7 @@ class Forecast:
         start, risks = mean_now(state), []
         for one, deviation, part in zip(horizons, drops, parts):
             law, wrong, n, squares, *_ = self._learned(one)
-            middle, spread = law.moments(list(part), start)
+            middle, spread = moments(law, list(part), start)
             either = below(voltage, middle, np.stack((
                 _wider(spread, deviation, (n, sag * sag * squares)), spread)))
             risks.append(wrong * either[0] + (1.0 - wrong) * either[1])

@@ -5,9 +5,9 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.filter.cutoff import (
-    cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
+    cutoff_for_noise, relative_cutoff, supply_noise, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
+from ou_monitor.online.settings import FilterSettings
 import pytest
 from scipy import integrate
 
@@ -25,10 +25,6 @@ def through(spectrum):
     """Integrate a two-sided spectrum over all frequencies, in Hz, by its logarithm."""
     return integrate.quad(lambda s: spectrum(math.exp(s)) * math.exp(s), -25.0, 35.0, limit=500,
                           epsrel=1e-10, epsabs=0.0)[0] / math.pi
-
-
-def test_every_law_has_its_function():
-    assert {*LAWS, 'kalman'} == set(NAMES)
 
 
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])

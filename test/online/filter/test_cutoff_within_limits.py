@@ -32,7 +32,7 @@ def check(f):
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 def test_any_stamps_sigma_and_parameters(order, blocks):
     f = AdaptiveLowPass(order=order, n0=1e-5)
-    t = 100.0
+    t, learned = 100.0, False
     for step, sigma, change, n, seed in blocks:
         if change:
             try:
@@ -50,7 +50,9 @@ def test_any_stamps_sigma_and_parameters(order, blocks):
             [f.filter(*one, sigma) for one in zip(stamps, x)])
         check(f)
         assert not np.isinf(out).any()
-        assert f.settings.law == 'kalman' or np.nanmax(np.abs(np.append(out, 0.0))) < 10.0
+        # After the law kalman the output goes over from what it was.
+        learned = learned or f.settings.law == 'kalman'
+        assert learned or np.nanmax(np.abs(np.append(out, 0.0))) < 10.0
 
 
 @pytest.mark.parametrize('order', [1, 2])
