@@ -30,6 +30,7 @@ from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, on_time, usable, why_no_model
 from ou_monitor.errors import InputError
+from ou_monitor.model.load_fit import Load
 from ou_monitor.model.sinusoid import LOBE
 from ou_monitor.model.spectral_lines import find_lines
 from ou_monitor.model.supply import SupplyModel
@@ -477,6 +478,9 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     duration = float(samples.t[-1])
     begin = _start_index(samples, fit_until, fitted=model is None)
     if model is None:
+        if samples.current is not None:
+            current, sign = on_time(samples.t, samples.voltage, samples.current, 'current', notes)
+            samples = replace(samples, current=sign * current)
         fitted = fit_flight(samples.part(slice(0, begin)), lambda share: report(0.6 * share))
         simulator: FlightModel | FiledModel = fitted
         notes += _fit_notes(fitted, samples)
@@ -620,18 +624,19 @@ def _start_index(samples: Readings, fit_until: float | None, fitted: bool) -> in
 
 
 def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
-    if model.load is not None:
+    fit = model.fits[0]
+    if fit.load is not Load.NONE:
         found = []
-        if model.load.model.full_current:
+        if fit.load is Load.CURRENT:
             found.append('The simulated load is current, which explains the voltage better than '
                          'throttle.' if samples.throttle is not None else
                          'The simulated load is current.')
-        falls = math.isnan(model.load.model.constant_level)
-        if model.doubt > _UNSURE:
+        doubt = float(model.odds[1])
+        if doubt > _UNSURE:
             found.append('Whether the pack discharges is open: the level '
-                         f'{"is constant" if falls else "falls"} in {percent(model.doubt)} of the '
+                         f'{"is constant" if fit.falls else "falls"} in {percent(doubt)} of the '
                          'simulations.')
-        elif not falls:
+        elif not fit.falls:
             found.append('No discharge is visible, so the level is constant.')
         return found
     if samples.current is None and samples.throttle is None:

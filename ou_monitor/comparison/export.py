@@ -17,7 +17,7 @@ import re
 import numpy as np
 from ou_monitor.comparison.compare import compare
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import cells_in_series, charge_at
+from ou_monitor.model.load import cells_in_series, charge_at, POWER
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.slow import Drift
@@ -37,8 +37,6 @@ SOURCES = {
 _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.
 _EMPTY, _CRITICAL = 3.5, 3.3
-# Exponent of the current over throttle that the discharge of the model assumes.
-_POWER = 1.8
 _SEEDS = 20  # Simulations of each model
 
 
@@ -113,7 +111,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
 def _numbers(model: SupplyModel, throttle: FloatArray) -> _Numbers:
     load, u0 = model.load, model.ou.u0
     cells = round(load.cells) if load is not None else cells_in_series(u0)
-    share = float(np.mean(throttle ** _POWER))
+    share = float(np.mean(throttle ** POWER))
     empty = min(cells * _EMPTY, u0)
     drain, charge = math.inf, math.nan
     drift = next((t for t in model.terms if isinstance(t, Drift)), None)

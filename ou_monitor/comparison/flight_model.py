@@ -12,15 +12,15 @@ in the same way; readings are treated as evenly spaced.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.model.arma import theta_at
 from ou_monitor.model.innovations import Filter, StateSpace
-from ou_monitor.model.load import LoadModel, lowpass
-from ou_monitor.model.load_fit import fit_load, level_evidence, LoadFit, SLOW_TIME
+from ou_monitor.model.load import lowpass
+from ou_monitor.model.load_fit import fit_load, Load, LoadFit, SLOW_TIME
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.ou_fit import (
     fit_pieces, load_signs, NoiseSize, stretches, usual_walk, white_variance)
@@ -28,7 +28,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.reading import Quantization
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
-from scipy.special import expit
+from scipy.special import softmax
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,13 +162,10 @@ def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
 class FlightModel:
     """Load model, slow process, OU and white noise, as fitted to a part of a recording."""
 
-    load: LoadFit | None  # The response to the load; None if there is only a level
-    # The response fitted with the other kind of level, constant or discharging; its probability.
-    other: LoadFit | None
-    doubt: float
-    # Level, V, without a load model, and its standard error.
-    level: float
-    level_se: float
+    # A level alone, or the load model with either kind of level; their probabilities, the larger
+    # first.
+    fits: tuple[LoadFit, ...]
+    odds: FloatArray
     damping: Damping  # Damping of the load's path
     sag_error: float  # Relative error of the sag, from held-out parts
     noise: FlightNoise  # The residual
@@ -177,45 +174,36 @@ class FlightModel:
     @property
     def names(self) -> list[str]:
         """Return the names of its terms, as in a model file."""
-        found = ['ou']
-        if self.load is not None:
-            found += ['load_sag', 'load_transient',
-                      *(['drift'] if math.isnan(self.load.model.constant_level) else [])]
-        return [*found, 'measurement_noise',
+        fit = self.fits[0]
+        return ['ou', *(['load_sag', 'load_transient'] if fit.load is not Load.NONE else []),
+                *(['drift'] if fit.falls else []), 'measurement_noise',
                 *(['load_dependent_noise'] if self.noise.sizes.follows else [])]
 
     def path(self, samples: Readings) -> FloatArray:
         """Return the mean voltage, V."""
-        if self.load is None:
-            return np.full(samples.t.size, self.level)
-        path = _path(samples, self.load.model)
-        if self.other is not None:
-            path = path + self.doubt * (_path(samples, self.other.model) - path)
-        return self.damping.of(path, samples.t)
+        paths = np.array([_path(fit, samples) for fit in self.fits])
+        return self.damping.of(self.odds @ paths, samples.t)
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V; the errors of the parameters are drawn too."""
-        n = samples.t.size
-        if self.load is None:
-            voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
-        else:
-            other = None if rng.random() >= self.doubt else self.other
-            load = (other or self.load).draw(rng)
-            path = _path(samples, load)
-            size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
-            resized = _path(samples, replace(load, size=size))
-            # The mean over the fitted part is known, so with a larger sag the level is higher.
-            path = resized - float((resized - path)[samples.t <= self.until].mean())
-            voltage = self.damping.of(path, samples.t) + simulate(
-                samples.t, 1.0 / SLOW_TIME,
-                math.sqrt(2.0 * self.load.slow_std ** 2 / SLOW_TIME), rng)
-        return np.asarray(voltage + self.noise.draw(
-            n, _simulated_load(self.load, samples), rng))
+        t, fitted = samples.t, samples.t <= self.until
+        fit = self.fits[int(rng.random() >= self.odds[0])].draw(rng)
+        path = _path(fit, samples)
+        resized = _path(fit.resized(math.exp(self.sag_error * rng.standard_normal())), samples)
+        # The mean over the fitted part is known, so with a larger sag the level is higher.
+        level = float((path - resized)[fitted].mean()) + self.noise.mean_error(
+            self.until) * rng.standard_normal()
+        slow = simulate(t, 1.0 / SLOW_TIME, fit.slow_std * math.sqrt(2.0 / SLOW_TIME), rng)
+        return np.asarray(level + self.damping.of(resized, t) + slow + self.noise.draw(
+            t.size, _load(fit.load, samples), rng))
 
 
-def _simulated_load(fit: LoadFit | None, samples: Readings) -> FloatArray | None:
-    by_current = fit is not None and fit.model.full_current != 0.0
-    return samples.current if by_current else samples.throttle
+def _load(kind: Load, samples: Readings) -> FloatArray | None:
+    return samples.current if kind is Load.CURRENT else samples.throttle
+
+
+def _path(fit: LoadFit, samples: Readings) -> FloatArray:
+    return fit.path(samples.t, _load(fit.load, samples))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,76 +233,49 @@ _PARTS = 4
 MOVES = 0.01
 # Minimum advantage in log evidence of the more complex of two loads, nats: odds of e to 1.
 _CLEAR = 1.0
-# Maximum readings in a fit of the load; more are averaged.
-_MOST = 40_000
 # Time constants tried for the damping, s.
 _FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 
 
 def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightModel:
     """Fit a model to samples: at least 100, over several seconds (report: progress, 0..1)."""
-    mean = float(samples.voltage.mean())
-    load, other, doubt = _best(samples, lambda share: report(0.4 * share)) or (None, None, 0.0)
-    held_out, damped, path = [], Damping(), np.full(samples.t.size, mean)
-    if load is not None:
-        for j in range(_PARTS):
-            part = slice(*(k * samples.t.size // _PARTS for k in (j, j + 1)))
-            fit = _fit(samples, load.model.full_current != 0.0,
-                       math.isfinite(load.model.constant_level), part, load)
-            held_out.append((_path(samples, fit.model)[part], samples.voltage[part]))
-            report(0.4 + 0.5 * (j + 1.0) / _PARTS)
-        path = _path(samples, load.model)
-        damped = damping(samples, path)
+    fits, odds = _best(samples)
+    report(0.5)
+    held_out, n = [], samples.t.size
+    for j in range(_PARTS if fits[0].load is not Load.NONE else 0):
+        part = slice(j * n // _PARTS, (j + 1) * n // _PARTS)
+        fit = _fit(samples, fits[0].load, fits[0].falls, part)
+        held_out.append((_path(fit, samples)[part], samples.voltage[part]))
+    path = odds @ np.array([_path(fit, samples) for fit in fits])
+    damped = damping(samples, path)
     noise = fit_noise(samples, samples.voltage - damped.of(path, samples.t),
-                      _simulated_load(load, samples),
-                      0.0 if load is None else load.slow_std ** 2)
-    duration = float(samples.t[-1] - samples.t[0])
+                      _load(fits[0].load, samples), fits[0].slow_std ** 2)
     report(1.0)
-    return FlightModel(load, other, doubt, mean, noise.mean_error(duration), damped,
-                       _sag_error(held_out), noise, float(samples.t[-1]))
+    return FlightModel(fits, odds, damped, _sag_error(held_out), noise, float(samples.t[-1]))
 
 
-def _best(samples: Readings, report: Callable[[float], None],
-          ) -> tuple[LoadFit, LoadFit, float] | None:
-    """Return the fit of the load, the fit with the other kind of level, and its probability."""
-    # None if no load has clearly more evidence than a level alone.  The simpler load comes first:
-    # throttle before current.
-    found: tuple[LoadFit, LoadFit, float] | None = None
-    most = level_evidence(samples.t, samples.voltage)
-    loads = [by_current for by_current, x, least in (
-        (False, samples.throttle, MOVES), (True, samples.current, 1e-300))
-        if x is not None and np.ptp(x) >= least]
-    for k, by_current in enumerate(loads):
-        constant, falling = (_fit(samples, by_current, kind) for kind in (True, False))
-        ahead = falling.evidence - constant.evidence
-        evidence = float(np.logaddexp(falling.evidence, constant.evidence)) - math.log(2.0)
-        if evidence > most + _CLEAR:
-            fit, other = (falling, constant) if ahead > 0.0 else (constant, falling)
-            found, most = (fit, other, float(expit(-abs(ahead)))), evidence
-        report((k + 1.0) / len(loads))
-    return found
+def _fit(samples: Readings, load: Load, falls: bool, left_out: slice = slice(0)) -> LoadFit:
+    return fit_load(load, samples.t, samples.voltage, _load(load, samples), falls=falls,
+                    left_out=left_out)
 
 
-def _fit(samples: Readings, by_current: bool, constant_level: bool,
-         without: slice | None = None, near: LoadFit | None = None) -> LoadFit:
-    """Fit the load; with very many samples, to means of neighbours."""
-    width = -(-samples.t.size // _MOST)
-    n = samples.t.size // width * width
-
-    def mean(x: FloatArray) -> FloatArray:
-        return np.asarray(x[:n].reshape(-1, width).mean(axis=1), dtype=np.float64)
-
-    left_out = None if without is None else (
-        float(samples.t[without.start]), float(samples.t[without.stop - 1]))
-    return fit_load(
-        mean(samples.t), mean(samples.voltage),
-        None if samples.throttle is None else mean(samples.throttle),
-        mean(samples.current) if by_current and samples.current is not None else None,
-        constant_level=constant_level, left_out=left_out, near=near)
-
-
-def _path(samples: Readings, model: LoadModel) -> FloatArray:
-    return model.path(samples.t, samples.throttle, samples.current)
+def _best(samples: Readings) -> tuple[tuple[LoadFit, ...], FloatArray]:
+    """Return the fits of the best load, with both kinds of level, and their probabilities."""
+    # The simpler comes first: no load, throttle, current.
+    fits: tuple[LoadFit, ...] = (_fit(samples, Load.NONE, falls=False),)
+    odds = np.ones(1)
+    most = fits[0].evidence
+    for load, x, least in ((Load.THROTTLE, samples.throttle, MOVES),
+                           (Load.CURRENT, samples.current, 1e-300)):
+        if x is None or not np.ptp(x) >= least:
+            continue
+        pair = sorted((_fit(samples, load, falls) for falls in (False, True)),
+                      key=lambda fit: -fit.evidence)
+        evidence = np.array([fit.evidence for fit in pair])
+        total = float(np.logaddexp(*evidence)) - math.log(2.0)
+        if total > most + _CLEAR:
+            fits, odds, most = tuple(pair), softmax(evidence), total
+    return fits, odds
 
 
 def damping(samples: Readings, path: FloatArray) -> Damping:

@@ -11,7 +11,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import lowpass
-from ou_monitor.model.load_fit import timing
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, MOST_THROTTLE, plausible, supplied
@@ -38,6 +37,11 @@ _EDGE = 0.05
 # Maximum gap in a current, s; quantile of its absolute value that counts as full load; lags of the
 # mean response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
+# Search for the delay of the load: number of shifts tried to each side, and maximum delay, s.
+_SHIFTS, _LATEST = 10, 0.2
+_PAYS = 0.95  # Ratio to which a delay must reduce the squared residuals
+_SLOWER = 1.0  # Time constant of the high-pass that removes trends, s
+_LATE = 0.06  # Time constant of the low-pass for the second regressor, s
 # Probability that an unrelated current is taken as the load if there is no throttle.
 _CHANCE = 0.02
 # Minimum autocorrelation from which a decay is computed.
@@ -141,6 +145,46 @@ def on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: li
     notes.append(f'The voltage responds {number(1e3 * late)} ms before the {name}: the stamps of '
                  f'the {name} are late, and were corrected.')
     return np.asarray(np.interp(t + late, t, load)), sign
+
+
+def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
+    """Return the delay of a load, s, and 1 if voltage falls when the load rises, else -1."""
+    # Shifts are counted in tenths of the sampling step.
+    dt = float(np.median(np.diff(t)))
+    unit = dt / _SHIFTS
+    slow = min(_SLOWER, 0.3 * float(t[-1] - t[0]))
+    left = v - lowpass(v, t, slow)
+    late = lowpass(load, t, _LATE)
+    loads = np.stack((load, late)) - lowpass(load, t, slow)
+
+    def fit(order: int, *shifts: int) -> tuple[float, float]:
+        """Return the squared residuals of `order`-th differences, and product load * voltage."""
+        # X: the mean of the load over the shifts.
+        X = np.diff(np.mean([[np.interp(t + shift * unit, t, row) for row in loads]
+                             for shift in shifts], axis=0), order)
+        y = np.diff(left, order)
+        product = X @ y
+        return float(y @ y - product @ np.linalg.lstsq(
+            X @ X.T, product, rcond=1e-9)[0]), float(product[0])
+
+    found: dict[int, tuple[float, float]] = {}
+    coarse, best = max(1, math.ceil(_LATEST / dt / _SHIFTS)), 0
+    for by in (coarse, math.ceil(coarse / _SHIFTS)):
+        for k in range(-_SHIFTS, _SHIFTS + 1):
+            shift = best + k * by * _SHIFTS
+            if shift not in found and abs(shift) * unit <= _LATEST:
+                found[shift] = fit(0, shift)
+        best = min(sorted(found, key=abs), key=lambda shift: found[shift][0])
+    # A best shift at the end of the range is not a minimum.
+    inside = abs(best) < max(found)
+    best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
+    # A delay wrong by half a sample leaves glitch-like errors at steep changes of the load.  But a
+    # shift by part of a sample also smooths a noisy load.  So the shifted load must fit better
+    # than its mean with the oppositely shifted load, which is equally smooth.
+    fine = {k: fit(1, best + k)[0] for k in range(-_SHIFTS, _SHIFTS + 1)}
+    k = min(sorted(fine, key=abs), key=lambda k: fine[k])
+    pays = min(fine[0], fit(1, best + k, best - k)[0]) > fine[k] * t.size ** (1.0 / t.size)
+    return (best + k * pays) * unit, -1.0 if found[best][1] > 0.0 else 1.0
 
 
 def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:

@@ -25,7 +25,6 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import whitened
 from ou_monitor.discovery import decision
 from ou_monitor.model.load import INRUSH_TIME
-from ou_monitor.model.load_fit import fit_load
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, LONGEST, SHORTEST
 from ou_monitor.model.terms.slow import Drift
@@ -34,8 +33,8 @@ from ou_monitor.records import FloatArray
 
 # Number of blocks that are held out in turn.
 FOLDS = 10
-# Maximum number of bin means in a fit of the load model; its time constants are 20 ms and more.
-_MOST = 2000
+# Usual time constants of the response to throttle, s: inrush, and two of polarisation.
+_USUAL = (INRUSH_TIME, 1.0, 20.0)
 # Ratio below which two time constants count as equal: half an octave, the spacing of the list.
 _ALIKE = 1.5
 # Steps by which time constants are refined, octaves.
@@ -45,25 +44,14 @@ _ROUNDS = 40
 
 
 def load_terms(samples: Samples) -> tuple[Term, ...]:
-    """Return the fitted load model as terms of the catalogue; none without throttle."""
+    """Return a usual response to throttle as terms of the catalogue; none without throttle."""
     if samples.throttle is None:
-        return ()
-    size = math.ceil(samples.n / _MOST)
-    count = samples.n // size
-
-    def mean(x: FloatArray) -> FloatArray:
-        return np.asarray(x[:count * size].reshape(count, size).mean(axis=1), dtype=np.float64)
-
-    u = np.clip(samples.throttle, 0.0, 1.0)
-    try:
-        model = fit_load(mean(samples.t - samples.t[0]), mean(samples.logged), mean(u)).model
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return ()
     duration = float(samples.t[-1] - samples.t[0])
     shortest = float(np.median(samples.step[1:]))
-    times = [tau for tau in (INRUSH_TIME, model.fast_time, model.slow_time)
-             if SHORTEST * shortest <= tau <= LONGEST * duration]
-    terms = (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
+    terms = (LoadSag(0.0, NEXT_TO_ZERO),
+             *(LoadTransient(0.0, tau, 0.0) for tau in _USUAL
+               if SHORTEST * shortest <= tau <= LONGEST * duration),
              Drift(0.0, NEXT_TO_ZERO))
     return tuple(term for term in terms if term.NAME in catalogue())
 

@@ -1,13 +1,8 @@
 """
-The voltage of a battery under load, from throttle or current; start values for the next flight.
+The voltage of a battery under load: cells, regressors and priors; start values for a flight.
 
-Limits: the form and its constants were chosen on nine recordings (doc/load.md).  All motors count
-as alike.  Charge is computed from the load; from throttle alone, wind and payload cause errors.
-
-v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
-x = ul^p (E/3.8)^(p-1) exp(-k h), ul = LP(u, lag), dq = x dt / (mean x T),
-dh = (sag/V) dq - h dt / 120 s,
-with u throttle, E(s) of `open_circuit`, h Ohmic heat, and LP(x, tau) a low-pass of order 1.
+Limits: the form and its constants were chosen on recordings (doc/load.md).  All motors count as
+alike.  Charge is computed from the load; from throttle alone, wind and payload cause errors.
 
 The start values (`LoadStart`: the response to throttle, known at take-off) come from one craft and
 one pack on one day; the filter widens their errors by the scatter between packs.  They set no
@@ -22,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import FloatArray
 
 Number = TypeVar('Number', float, FloatArray)
 
@@ -45,9 +40,6 @@ _KNEE, _KNEE_SLOPE = 0.079, 1.2
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
-# Time constant with which a pack cools, s (60 and 120 fit the nine flights of
-# doc/results/compare_flights.md equally well; nazgul and gecko were worse without cooling).
-_COOLING = 120.0
 
 
 def open_circuit(charge: npt.ArrayLike) -> FloatArray:
@@ -88,82 +80,16 @@ def lowpass(x: FloatArray, t: FloatArray, tau: float, start: float | None = None
     return first_order(keep, (1.0 - keep) * x, float(x[0]) if start is None else start)
 
 
-@dataclass(frozen=True)
-class LoadModel:
-    """The parameters of the voltage under load."""
-
-    cells: int  # Cells in series, N
-    mean_load: float  # Mean of x over the recording, the load to which `endurance` refers
-    charge: float = 0.7  # Charge at the first sample, s0, 0..1
-    size: float = 0.12  # Immediate relative sag at full throttle, S/(3.8 N)
-    power: float = 1.8  # Exponent p of current over throttle
-    # Polarisation f1, relative to the sag, and its time constant t1, s.
-    fast_share: float = 0.2
-    fast_time: float = 1.0
-    # Polarisation f2 and its time constant t2, s.
-    slow_share: float = 0.3
-    slow_time: float = 20.0
-    inrush: float = 0.5  # Inrush at a step from rest to full throttle, K, relative to the sag
-    lag: float = 0.01  # Lag of the sag behind throttle, s
-    endurance: float = 350.0  # Time at the mean load that would empty a full pack, T, s
-    before: float = 0.3  # Mean load before the first sample, relative to `mean_load`
-    # Current at full load, A, negative if discharge currents are negative; 0: load is throttle.
-    full_current: float = 0.0
-    delay: float = 0.0  # Delay of the load behind the voltage, s
-    # Decrease of ln(resistance) per unit of charge and relative sag; a pack without cooling (150
-    # Wh/kg, 1 kJ/kg/K, -1.5 %/K) would have 8.
-    heating: float = 2.0
-    constant_level: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
-
-    def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the steady sag, V, at a throttle of 0..1, of cold cells at 3.8 V."""
-        if self.full_current:
-            raise ValueError('the load of this model is a current, not throttle')
-        x = np.asarray(throttle, dtype=np.float64) ** self.power
-        return np.asarray(
-            self.size * CELL * self.cells * (1.0 + self.fast_share + self.slow_share) * x)
-
-    def path(self, t: FloatArray, throttle: FloatArray | None,
-             current: FloatArray | None = None) -> FloatArray:
-        """Return the mean voltage, V, at stamps, s, from throttle, 0..1, or current, A."""
-        read = current if self.full_current else throttle
-        if read is None:
-            what = 'a current, A,' if self.full_current else 'throttle'
-            raise ValueError(f'the load of this model is {what} and none was given')
-        if not (np.isfinite(read).all() and (self.full_current or (
-                (read >= 0.0) & (read <= 1.0)).all())):
-            raise ValueError('throttle must lie within 0..1, and current be finite, A')
-        dt = np.diff(t, prepend=t[0])
-        full = self.mean_load * self.endurance
-        lagged = lowpass(np.interp(t + self.delay, t, read), t, self.lag)
-        x = lagged / (self.full_current or 1.0)
-        if not self.full_current:
-            # A propeller draws less at a lower voltage: I ~ u (u V)^(p - 1).
-            x = lagged ** self.power
-            if math.isnan(self.constant_level):
-                level = open_circuit(np.clip(self.charge - np.cumsum(x * dt) / full, 0.0, 1.0))
-                x = x * (level / CELL) ** (self.power - 1.0)
-        rest: FloatArray | float = self.constant_level
-        if math.isnan(self.constant_level):
-            # Ohmic heat warms the pack, which lowers its resistance.
-            total = self.size * (1.0 + self.fast_share + self.slow_share)
-            x = x * np.exp(-self.heating * total * _COOLING / full * lowpass(
-                x * x, t, _COOLING, 0.0))
-            rest = self.cells * open_circuit(np.maximum(
-                self.charge - np.cumsum(x * dt) / full, -1.0))
-        response = x + self.fast_share * lowpass(x, t, self.fast_time)
-        response += self.slow_share * lowpass(x, t, self.slow_time, self.before * self.mean_load)
-        if not self.full_current:
-            response += self.inrush * np.maximum(lagged - lowpass(lagged, t, INRUSH_TIME), 0.0)
-        return np.asarray(rest - self.size * CELL * self.cells * response, dtype=np.float64)
-
-
 # Time constants of the response in flight, s: motors (0.06), sensors and converters (0.35),
-# polarisation (2 and 15, rounded medians of `load_fit`).  They are a factor of 6 to 8 apart, so
-# that sums of their responses approximate any time constant up to 10 s.
+# polarisation (2 and 15, rounded medians of fits of two RC pairs).  They are a factor of 6 to 8
+# apart, so that sums of their responses approximate any time constant up to 10 s.
 LAGS = (0.06, 0.35, 2.0, 15.0)
 # Those of LAGS after which the response has a part linear in throttle too, s.
 LINEAR_LAGS = (0.35, 2.0)
+# Exponent p of throttle in the load x; the level has the exponent p - 1.
+POWER = 1.8
+# Lag of the whole response to throttle, s: half of the response time of an ESC.
+LAG = 0.004
 # Number of coefficients: of x = u^1.8, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush.
 SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
 # Number of fields at the end of LoadStart that a model file may omit.
@@ -251,23 +177,24 @@ def _numbers(value: Any) -> Any:
     return float(value)
 
 
-def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
-    """Return prior mean and covariance of the coefficients, and mean sag, each per volt."""
-    # The coefficients are S b, with a log-normal S of median 0.12.  Priors of the parts of b:
+# Response to a current: its shares at once and after each of LAGS, and their prior deviations.
+CURRENT_SHARES = np.array([1.0, 0.1, 0.05, 0.2, 0.3])
+CURRENT_SHARE_STD = np.array([0.3, 0.3, 0.1, 0.1, 0.15])
+# Sag at full throttle, relative to the voltage: median, and deviation of its logarithm.
+SAG, SAG_SD = 0.12, 0.6
+
+
+def usual_shares() -> tuple[FloatArray, FloatArray]:
+    """Return the coefficients' shares of the sag: prior mean, and a root of their covariance."""
     # - x after 60 ms: beta(0.5, 1); x after 0.35 s: normal(0.05, 0.1);
     # - u and u^3: normal(0, 0.2); u after a lag: normal(0, 0.1); the others: log-normal;
     # - x: 1, less the parts of x after 60 ms and 0.35 s, less 0.7 times the parts of u and u^3.
     # The coefficient of x after a lag includes -0.7 times the part of u after that lag.
     # The deviations were chosen among six sets (0.1 to 0.3 for 0.35 s, 0.07 to 0.2 for u after a
     # lag) on twelve recorded flights, where prediction errors one second ahead differ by < 1 %.
-    def lognormal(median: float, deviation: float) -> tuple[float, float]:
-        mean = median * math.exp(0.5 * deviation ** 2)
-        return mean, mean ** 2 * math.expm1(deviation ** 2)
-
-    size, size_var = lognormal(0.12, 0.6)
     parts = [(0.0, 0.2 ** 2), (0.0, 0.2 ** 2), (1.0 / 3.0, 4.0 / 45.0), (0.05, 0.1 ** 2),
-             lognormal(0.2, 0.5), lognormal(0.3, 0.5), *[(0.0, 0.1 ** 2)] * len(LINEAR_LAGS),
-             lognormal(1.5, 1.0)]
+             _lognormal(0.2, 0.5), _lognormal(0.3, 0.5), *[(0.0, 0.1 ** 2)] * len(LINEAR_LAGS),
+             _lognormal(1.5, 1.0)]
     means, variances = np.array(parts).T
     mix = np.eye(SIZE)[:, 1:]
     mix[0, :4] = -0.7, -0.7, -1.0, -1.0
@@ -275,6 +202,17 @@ def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
         mix[3 + LAGS.index(tau), 2 + len(LAGS) + k] = -0.7
     mean = mix @ means
     mean[0] += 1.0
+    return mean, mix * np.sqrt(variances)
+
+
+def _lognormal(median: float, deviation: float) -> tuple[float, float]:
+    """Return mean and variance."""
+    mean = median * math.exp(0.5 * deviation ** 2)
+    return mean, mean ** 2 * math.expm1(deviation ** 2)
+
+
+def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
+    """Return prior mean and covariance of the coefficients, and mean sag, each per volt."""
+    (size, size_var), (mean, root) = _lognormal(SAG, SAG_SD), usual_shares()
     square = np.outer(mean, mean)
-    cov = (size ** 2 + size_var) * (mix @ np.diag(variances) @ mix.T + square) - size**2 * square
-    return size * mean, cov, size
+    return size * mean, (size ** 2 + size_var) * (root @ root.T + square) - size**2 * square, size

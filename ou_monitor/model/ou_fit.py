@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import CELL
+from ou_monitor.model.load import CELL, POWER
 from ou_monitor.model.sinusoid import tones
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS, OuFacts
@@ -105,7 +105,6 @@ _QUARTER = 0.25
 _SPANNED = 1e-5
 # Minimum periods of a line between knots of the level, which absorbs slower lines.
 _PERIODS = 10.0
-_POWER = 1.8  # Exponent of the load over throttle
 
 
 def usual_walk(v: FloatArray) -> float:
@@ -214,7 +213,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
     def of_throttle(x: FloatArray) -> list[FloatArray]:
         x = np.clip(np.abs(x), 0.0, 2.0)
-        return [x, x ** 3, *responses(x ** _POWER)]
+        return [x, x ** 3, *responses(x ** POWER)]
 
     columns = level
     last = slice(-_DELAY_READINGS, None)

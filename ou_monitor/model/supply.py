@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import charge_at, LoadStart, open_circuit
+from ou_monitor.model.load import charge_at, LoadStart, open_circuit, POWER
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Effect, Segment, Stage, Term
 from ou_monitor.records import FloatArray
@@ -106,10 +106,6 @@ class SupplyModel:
         return voltage
 
 
-# Exponent of throttle in the discharge current, as in `LoadStart.discharge`.
-_POWER = 1.8
-
-
 class Discharge:
     """Fall of the level as the pack discharges; `charge` is the remaining charge, 0..1."""
 
@@ -122,7 +118,7 @@ class Discharge:
     def __call__(self, s: Segment) -> None:
         """Lower the level as throttle draws charge in a segment."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
-        left = self.charge - np.cumsum(self._load.discharge * s.throttle ** _POWER * step)
+        left = self.charge - np.cumsum(self._load.discharge * s.throttle ** POWER * step)
         s.level += self._load.cells * (open_circuit(left) - open_circuit(self._origin))
         self.charge = float(left[-1])
 

@@ -10,7 +10,7 @@ from ou_monitor.comparison.compare import (
 from ou_monitor.comparison.flight_model import (
     _sag_error, damping, fit_flight, fit_noise, FlightNoise, Readings)
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadModel, lowpass
+from ou_monitor.model.load import lowpass
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
@@ -21,6 +21,7 @@ from ou_monitor.report.comparison_document import _answer, _path
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
+from simulated_packs import Pack
 
 ALPHA, SIGMA, LEVEL, SAG = 20.0, 0.3, 15.0, 1.5
 
@@ -132,24 +133,12 @@ def test_only_the_part_after_fit_until_is_simulated():
     assert found.traces.t[0] == 30.0
 
 
-class Marked:
-    """A fit of the load that counts how often it is drawn."""
-
-    def __init__(self, fit, kinds):
-        self.fit, self.kinds, self.slow_std = fit, kinds, fit.slow_std
-
-    def draw(self, rng):
-        """Draw a model, and count it."""
-        self.kinds.append(1)
-        return self.fit.draw(rng)
-
-
 def flight(seed: int, n: int = 1500, rate: float = 50.0) -> Recording:
     """Return a flight of a pack whose noise follows throttle, in steps of 10 mV."""
     rng = np.random.default_rng(seed)
     t = np.arange(n) / rate
     u = 0.2 + 0.6 * throttle(t, seed)
-    pack = LoadModel(4, 0.3, charge=0.8, endurance=400.0)
+    pack = Pack(4, 0.3, charge=0.8, endurance=400.0)
     noise = 0.05 * np.exp(u * (1.4 - u) / 0.49 - 1.0) * rng.standard_normal(n)
     return Recording(t, 0.01 * np.rint(100.0 * (pack.path(t, u) + noise)), u, 'pack')
 
@@ -291,18 +280,21 @@ def test_both_kinds_of_level_are_simulated_by_their_probability():
     recording = flight(0)
     samples = Readings(recording.t, recording.voltage, recording.throttle)
     found = fit_flight(samples, lambda share: None)
-    ahead = abs(found.load.evidence - found.other.evidence)
-    assert math.isnan(found.load.model.constant_level) != math.isnan(
-        found.other.model.constant_level)
-    assert found.doubt == pytest.approx(1.0 / (1.0 + math.exp(ahead)))
-    one, other, both = (replace(found, doubt=doubt).path(samples) for doubt in (0.0, 1.0, 0.3))
-    assert both == pytest.approx(0.7 * one + 0.3 * other)
+    one, other = found.fits
+    assert one.falls is not other.falls
+    assert found.odds == pytest.approx(
+        np.array([1.0, math.exp(other.evidence - one.evidence)]) * found.odds[0])
+    # Levels 1 kV apart, so that each draw shows which was drawn.
+    far = replace(other, values=other.values + np.append(1e3, np.zeros(other.values.size - 1)),
+                  falls=False)
+    mixed = replace(found, fits=(one, far), odds=np.array([0.7, 0.3]))
+    assert mixed.path(samples) == pytest.approx(0.7 * replace(
+        found, odds=np.array([1.0, 0.0])).path(samples) + 0.3 * replace(
+        mixed, odds=np.array([0.0, 1.0])).path(samples))
     # 300 draws: 0.3 +- 0.026; 4 of them.
-    rng, kinds = np.random.default_rng(1), []
-    chosen = replace(found, doubt=0.3, other=Marked(found.other, kinds))
-    for _ in range(300):
-        chosen.draw(samples.part(slice(0, 200)), rng)
-    assert len(kinds) / 300 == pytest.approx(0.3, abs=0.106)
+    part, rng = samples.part(slice(0, 200)), np.random.default_rng(1)
+    high = [mixed.draw(part, rng).mean() > 500.0 for _ in range(300)]
+    assert np.mean(high) == pytest.approx(0.3, abs=0.106)
 
 
 @pytest.mark.parametrize('offset', [0.0, 0.25, 0.5, 0.75])

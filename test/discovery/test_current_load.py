@@ -8,7 +8,7 @@ from ou_monitor import discover, Recording
 from ou_monitor.cli.recorded import model_text
 from ou_monitor.criticism.readings import load_of
 from ou_monitor.model.load import lowpass
-from ou_monitor.model.load_fit import timing
+from ou_monitor.criticism.readings import timing
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU

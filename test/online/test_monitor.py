@@ -4,7 +4,6 @@ import math
 
 from hypothesis import given, settings as hypothesis_settings, strategies as st
 import numpy as np
-from ou_monitor.model.load import LoadModel
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadStatus
@@ -15,6 +14,7 @@ from ou_monitor.recordings.model_file import read_model
 from ou_monitor.records import Level, Status
 from project import ROOT
 import pytest
+from simulated_packs import Pack
 
 
 def filled(seed=3, sigma=0.632, u0=5.0, n=2001, **settings):
@@ -278,7 +278,7 @@ def test_the_budget_keeps_under_the_warning_when_told_so():
     assert MonitorSettings(brownout_budget_limit=0.05).budget_limit == 0.05
 
 
-TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
 
 
 @pytest.fixture(scope='module')

@@ -14,22 +14,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from ou_monitor.model.load import LAGS, LEVELS, SLOPES
+from ou_monitor.model.load import (
+    CURRENT_SHARE_STD, CURRENT_SHARES, LAGS, LEVELS, POWER, SLOPES)
 from ou_monitor.online.load.blocks import (
     CLIP, DIVERGED, LoadBlock, LoadDelay, LoadNoise, log_density)
-from ou_monitor.online.load.supply_load import AT_ONCE, hold, POWER, reached
+from ou_monitor.online.load.supply_load import AT_ONCE, hold, reached
 from ou_monitor.records import FloatArray, NAN
 
 # Minimum current for starting the filter, A; factor by which the largest current must rise before
 # the state is rescaled and the prior is applied again.
 _LEAST, _MORE = 1e-2, 4.0
-# Prior: standard deviation of the voltage drop at the largest current, relative to the voltage;
-# shares of the drop that appear at once and after each of LAGS; standard deviations of the shares.
+# Prior: standard deviation of the voltage drop at the largest current, relative to the voltage.
 _FALL = 0.3
-_SHARES = np.array([1.0, 0.1, 0.05, 0.2, 0.3])
-_SHARE_STD = (0.3, 0.3, 0.1, 0.1, 0.15)
-_PRIOR = _FALL ** 2 * (np.outer(_SHARES, _SHARES) + np.diag(np.square(_SHARE_STD)))
-_DRAWN_STATES = 2 + _SHARES.size
+_PRIOR = _FALL ** 2 * (np.outer(CURRENT_SHARES, CURRENT_SHARES) + np.diag(CURRENT_SHARE_STD ** 2))
+_DRAWN_STATES = 2 + CURRENT_SHARES.size
 # Random walk of the level, V per sqrt(s) and cell: twice the walk in `LoadFilter`, because less is
 # known about the discharge.
 _DRAWN_WALK = 0.003
@@ -37,7 +35,7 @@ _DRAWN_WALK = 0.003
 # discharge.
 _EMPTY = 100.0
 # Variance of the change of each coefficient, per second: 2 % of a sag of 12 % in 100 s.
-_DRAWN_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(_SHARES.size)
+_DRAWN_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(CURRENT_SHARES.size)
 # Relative error above which the resistance counts as unknown; minimum relative error, because the
 # filter's own error omits the warming of a pack.
 _KNOWN, LEAST_ERROR = 0.33, 0.1
@@ -52,8 +50,8 @@ _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # hebi_x); 0.005 to 0.8 occurred on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1,
 # and regbot_28, 62 and 81.
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
-# Exponents of throttle tried for that regressor: the median of the prior in `load_fit`, plus and
-# minus up to about two of its standard deviations.
+# Exponents of throttle tried for that regressor: the usual one, plus and
+# minus up to about two of its standard deviations between crafts.
 _POWERS = np.array([1.4, 1.6, 1.8, 2.0, 2.2])
 # Time for which the last throttle or current is held if the present one is unknown, s.
 UNKNOWN_HELD = 1.0

@@ -15,20 +15,18 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import (
-    CELL, cells_in_series, INRUSH_TIME, LAGS, LEVELS, LINEAR_LAGS, LoadStart, ripple, SLOPES,
-    usual_coefficients)
+    CELL, cells_in_series, INRUSH_TIME, LAG, LAGS, LEVELS, LINEAR_LAGS, LoadStart, POWER, ripple,
+    SLOPES, usual_coefficients)
 from ou_monitor.online.load.blocks import (
     CLIP, DIVERGED, EQUAL, LoadBlock, LoadBlocks, LoadChange, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.current_filter import CurrentFilter, UNKNOWN_HELD
 from ou_monitor.online.load.model_watch import (
     BINS, compare, LoadContrasts, ModelComparison, NEAR, OTHER_LEVEL, other_pack, SIZE_ERROR)
 from ou_monitor.online.load.supply_load import (
-    Basis, hold, LoadState, LoadStatus, POWER, rising, static, SupplyLoad, TABLE)
+    Basis, hold, LoadState, LoadStatus, rising, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
 
-# Lag of the whole response, s: half of the response time of an ESC.
-_LAG = 0.004
 # Random walk of the level, V per sqrt(s) and cell: usual, as in an OU of 4.6 mV and 20 s (from the
 # batch fit); and for a nearly empty pack (chosen on bf_hiro_4s; 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
@@ -329,8 +327,8 @@ class LoadFilter:
                          *(g * x for x in self._lags), g * max(u - self._settled, 0.0)])
 
     def _advance(self, dt: float, u: float) -> float:
-        """Advance the regressors by dt, s (exact once `_LAG` has settled); return the load."""
-        self._lagged = u + (self._lagged - u) * math.exp(-dt / _LAG)
+        """Advance the regressors by dt, s (exact once `LAG` has settled); return the load."""
+        self._lagged = u + (self._lagged - u) * math.exp(-dt / LAG)
         self._settled = self._lagged + (self._settled - self._lagged) * math.exp(
             -dt / INRUSH_TIME)
         x = self._lagged ** POWER

@@ -13,12 +13,9 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import LAGS, LINEAR_LAGS
+from ou_monitor.model.load import LAGS, LINEAR_LAGS, POWER
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-# Exponent p of throttle in the load, from the prior of `load_fit`; the level has the exponent
-# p - 1.
-POWER = 1.8
 # Time at constant throttle for which the sag is stated, s: motors and converters have settled, and
 # longer bursts of throttle are rare.  If the load has been known for less than _HOLDS times HOLD,
 # the sag is stated for 1/_HOLDS of that time, because for a longer time it would be extrapolated.

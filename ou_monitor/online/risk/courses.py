@@ -30,9 +30,9 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import numpy.typing as npt
-from ou_monitor.model.load import INRUSH_TIME, LAGS, LINEAR_LAGS
+from ou_monitor.model.load import INRUSH_TIME, LAGS, LINEAR_LAGS, POWER
 from ou_monitor.model.passage import normal_below
-from ou_monitor.online.load.supply_load import LoadState, POWER
+from ou_monitor.online.load.supply_load import LoadState
 from ou_monitor.records import FloatArray, NAN
 
 # Duration of the first group after a rise, in time constants of the inrush.

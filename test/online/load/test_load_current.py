@@ -1,14 +1,15 @@
 """Current in the load filter: resistance, level without throttle, and no harm from a wrong one."""
 
 import numpy as np
-from ou_monitor.model.load import LoadModel, lowpass
+from ou_monitor.model.load import lowpass
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import Basis, LoadStatus
 import pytest
+from simulated_packs import Pack
 
 FULL = 60.0
-TRUE = LoadModel(4, 0.25, charge=0.85, size=0.1, full_current=FULL, fast_share=0.1, slow_share=0.2,
-                 inrush=1e-9, lag=1e-4)
+TRUE = Pack(4, 0.25, charge=0.85, size=0.1, full_current=FULL, fast_share=0.1, slow_share=0.2,
+            inrush=1e-9, lag=1e-4)
 OHM = 0.1 * 4 * 3.8 / FULL
 
 

@@ -1,13 +1,13 @@
 """Throttle that is late or unrelated to the voltage, and coarse ADCs."""
 
 import numpy as np
-from ou_monitor.model.load import LoadModel
 from ou_monitor.online.load.blocks import DELAYS, LoadDelay
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadStatus
 import pytest
+from simulated_packs import Pack
 
-TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
 
 
 @pytest.fixture(scope='module')
@@ -74,7 +74,7 @@ def test_steps_of_the_adc_that_hide_the_answer():
     rng = np.random.default_rng(2)
     t = np.arange(0.0, 40.0, 0.02)
     u = np.clip(0.6 + 0.05 * rng.standard_normal(161), 0.0, 1.0)[(4 * t).astype(int)]
-    cell = LoadModel(1, 0.4, charge=0.6, size=0.15, power=1.8, endurance=2000.0)
+    cell = Pack(1, 0.4, charge=0.6, size=0.15, power=1.8, endurance=2000.0)
     v = cell.path(t, u) + 0.002 * rng.standard_normal(t.size)
     coarse = loaded(t, np.round(v, 1), u).load()
     size = 0.15 * 3.8 * 0.6 ** 1.8

@@ -3,15 +3,16 @@
 import dataclasses
 
 import numpy as np
-from ou_monitor.model.load import LAGS, LoadModel, lowpass
+from ou_monitor.model.load import LAGS, lowpass
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import HOLD, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
 from ou_monitor.timeline import as_columns, TimeLine
 import pytest
+from simulated_packs import Pack
 
-TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
 # Its sag after a second at full throttle, V.
 SAG = 0.15 * 15.2 * (1.0 + 0.2 * -np.expm1(-HOLD / 1.0) + 0.3 * -np.expm1(-HOLD / 20.0))
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadModel, LoadStart
+from ou_monitor.model.load import LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.online.load.load_filter import LoadFilter
@@ -12,9 +12,10 @@ from ou_monitor.online.load.supply_load import HOLD, LoadStatus
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.recordings.model_file import as_yaml, ModelFile, parse_model, read_model
 import pytest
+from simulated_packs import Pack
 import yaml
 
-TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
 # Sag after a second at full throttle, relative to `size`, V.
 SAG = 15.2 * (1.0 + 0.2 * -np.expm1(-HOLD / 1.0) + 0.3 * -np.expm1(-HOLD / 20.0))
 
