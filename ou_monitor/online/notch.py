@@ -41,7 +41,7 @@ A step of the coefficients causes a step of y, so the caller changes them smooth
 
 The filter is stable under any sequence of f, k and m: with K the smallest k, P = [[1, e], [e, 1]]
 and e < 4 K / (4 + K^2), s^T P s is a Lyapunov function for every k in K..2, and m is outside the
-loop.  test_biquads.py computes a bound of the state; adversarial sequences reach a tenth of it.
+loop.  test_notch.py checks this for random coefficients.
 """
 
 from __future__ import annotations

@@ -31,11 +31,6 @@ def test_no_lattice_no_finding(seed):
         assert (quality.step, quality.held, quality.saturated) == (0.0, 1, False)
 
 
-def test_rms_increment_is_that_of_an_ou():
-    """Of an OU: sigma sqrt(dt) (1 - alpha dt / 4) = 19.7 mV; 1023 increments give 2 %."""
-    assert examine(path()).rms_increment == pytest.approx(0.0197, rel=0.07)
-
-
 @pytest.mark.parametrize('side', [-1, 1])
 def test_clipped_samples_are_counted_at_their_end(side):
     """Clipped at one standard deviation, or at 1.7: 16 or 4 % of samples at the end."""
@@ -80,7 +75,7 @@ def test_a_random_walk_does_not_drift():
     """Its net change is chance: more than four standard deviations in 1 of 16 000."""
     # Two of 100 would be a chance of 2e-5; a limit of two deviations would make it five, and none
     # or one with a chance of 4 %. Where a trend and a restoring force are found together, that is
-    # the fit's doing, and looked at in test_estimator_limits.
+    # the fit's doing, and looked at in test_estimator_slides.
     rng = np.random.default_rng(2)
     for n in (60, 200, 2000):
         walks = LEVEL + np.cumsum(0.01 * rng.standard_normal((100, n)), axis=1)

@@ -1,14 +1,164 @@
-"""The adaptive low-pass as a whole: inputs that change its output, and those that must not."""
+"""The low-pass against scipy, and as a whole: what changes its output, and what must not."""
 
 import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import AdaptiveLowPass
-from ou_monitor.online.filter.cutoff import Bound
-from ou_monitor.online.filter.cutoff import relative_cutoff
+from ou_monitor.online.filter.cutoff import Bound, relative_cutoff
+from ou_monitor.online.filter.filter_state import cutoff_for_lag, delay, LowPassState, phase_lag
 from ou_monitor.online.settings import FILTER_PARAMETERS, FilterSettings
 import pytest
+from scipy import integrate, signal
+
+
+def analog(order, fc, mode):
+    num, den = signal.butter(order, 2.0 * math.pi * fc, analog=True)
+    return (np.polymul(num, [1.0, 0.0]) if mode == 'derivative' else num), den
+
+
+def run(order, fc, mode, t, x):
+    """Filter samples with one cutoff, starting at rest at the first."""
+    state, out = LowPassState(0.0 if mode == 'derivative' else x[0]), []
+    for k in range(1, len(t)):
+        dt = t[k] - t[k - 1]
+        slope = (x[k] - x[k - 1]) / dt
+        ends = (slope, slope) if mode == 'derivative' else (x[k - 1], x[k])
+        out.append(state.advance(order, 2.0 * math.pi * fc * dt, *ends))
+    return np.array(out)
+
+
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('fc', [0.01, 5.0, 40.0, 150.0, 450.0])
+def test_equals_the_linear_input_solution_of_scipy(order, fc, mode):
+    """First-order-hold discretisation by scipy, sample for sample."""
+    dt = 1e-3
+    x = np.random.default_rng(1).standard_normal(400)
+    x[0] = 0.0
+    ad, bd, cd, dd, _ = signal.cont2discrete(
+        signal.tf2ss(*analog(order, fc, mode)), dt, method='foh')
+    _, expected, _ = signal.dlsim((ad, bd, cd, dd, dt), x)
+    got = run(order, fc, mode, np.arange(400) * dt, x)
+    scale = np.abs(expected).max()
+    assert got == pytest.approx(expected[1:, 0], abs=1e-9 * scale, rel=1e-7)
+
+
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+@pytest.mark.parametrize('order', [1, 2])
+def test_irregular_steps_and_moving_cutoffs_against_an_ode_solver(order, mode):
+    rng = np.random.default_rng(5)
+    t = np.concatenate([[0.0], np.cumsum(10.0 ** rng.uniform(-4.0, -1.0, 60))])
+    x = rng.standard_normal(61)
+    w = 2.0 * math.pi * 10.0 ** rng.uniform(0.0, 2.3, 60)
+    state = LowPassState(0.0 if mode == 'derivative' else x[0])
+    reference = np.array([state.y, 0.0])
+    for k in range(60):
+        dt, slope = t[k + 1] - t[k], (x[k + 1] - x[k]) / (t[k + 1] - t[k])
+
+        def rate(s, z, k=k, slope=slope):
+            u = slope if mode == 'derivative' else x[k] + slope * s
+            if order == 1:
+                return [w[k] * (u - z[0]), 0.0]
+            return [w[k] * z[1], w[k] * (u - z[0] - math.sqrt(2.0) * z[1])]
+        reference = integrate.solve_ivp(
+            rate, (0.0, dt), reference, method='DOP853', rtol=1e-11, atol=1e-12).y[:, -1]
+        ends = (slope, slope) if mode == 'derivative' else (x[k], x[k + 1])
+        got = state.advance(order, w[k] * dt, *ends)
+        assert got == pytest.approx(reference[0], rel=1e-7, abs=1e-8)
+
+
+@pytest.mark.parametrize('order', [1, 2])
+def test_short_steps_lose_nothing(order):
+    """100 000 steps of 1e-8 of the time constant add up to the one long step."""
+    short, long = LowPassState(), LowPassState()
+    for k in range(100_000):
+        short.advance(order, 1e-8, k * 1e-5, (k + 1) * 1e-5)
+    long.advance(order, 1e-3, 0.0, 1.0)
+    assert short.y == pytest.approx(long.y, rel=1e-6)
+
+
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('fc', [5.0, 10.0, 40.0])
+def test_lag_is_that_of_the_filter(order, fc):
+    """Phase of scipy's response; and FIELD's 14, 27, 45, 63 degrees of order 1 come out."""
+    response = signal.freqs(*analog(order, fc, 'lowpass'), worN=[20.0 * math.pi])[1][0]
+    lag = phase_lag(order, fc, 10.0)
+    assert lag == pytest.approx(-math.degrees(np.angle(response)))
+    assert delay(lag, 10.0) == pytest.approx(lag / 3600.0)
+    assert cutoff_for_lag(order, lag, 10.0) == pytest.approx(fc)
+
+
+@pytest.mark.parametrize('order, lag', [(1, 90.0), (2, 180.0), (1, 0.0), (2, math.nan)])
+def test_impossible_lags_are_refused(order, lag):
+    with pytest.raises(ValueError, match='lags by more than 0'):
+        cutoff_for_lag(order, lag, 10.0)
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+STEP = st.one_of(st.sampled_from([1e-3, 1e-4, 0.0, -1e-3, -50.0, 1e-9, 1.0, 33.0, 1e9]), ANY)
+SIGMA = st.one_of(st.floats(0.0, 10.0), ANY)
+CHANGE = st.one_of(st.none(), st.fixed_dictionaries({}, optional={
+    'fmin': st.sampled_from([0.01, 5.0, 20.0, 60.0]), 'fmax': st.sampled_from([100.0, 3000.0]),
+    'max_lag': st.sampled_from([0.0, 30.0]), 'fallback': st.sampled_from([70.0, 99.0]),
+    'law': st.sampled_from(['threshold', 'constant_noise', 'kalman']),
+    'slew': st.sampled_from([0.0, 4.0]), 'shadow': st.booleans()}))
+
+
+def check(f):
+    """Assert that what the filter publishes lies within its limits."""
+    low, high = f.settings.lowest, f.settings.fmax
+    assert low <= f.cutoff <= high, f.bound
+    assert math.isnan(f.wanted) or low <= f.wanted <= high
+    assert f.bound is not None and math.isfinite(f.phase_lag)
+
+
+@settings(max_examples=150, deadline=None)
+@given(order=st.sampled_from([1, 2]), blocks=st.lists(st.tuples(
+    STEP, SIGMA, CHANGE, st.sampled_from([1, 5, 60, 150]), st.integers(0, 99)),
+    min_size=1, max_size=10))
+@pytest.mark.filterwarnings('ignore::RuntimeWarning')
+def test_any_stamps_sigma_and_parameters(order, blocks):
+    f = AdaptiveLowPass(order=order, n0=1e-5)
+    t, learned = 100.0, False
+    for step, sigma, change, n, seed in blocks:
+        if change:
+            try:
+                f.configure(**change)
+            except ValueError:
+                pass
+            check(f)
+        rng = np.random.default_rng(seed)
+        stamps = t + step * np.arange(1.0, n + 1.0)
+        if seed % 3 == 0:
+            stamps = 100.0 * rng.random(n)
+        t = float(stamps[-1]) if math.isfinite(stamps[-1]) else 100.0
+        x = rng.standard_normal(n)
+        out = f.filter(stamps, x, sigma) if seed % 2 else np.array(
+            [f.filter(*one, sigma) for one in zip(stamps, x)])
+        check(f)
+        assert not np.isinf(out).any()
+        # After the law kalman the output goes over from what it was.
+        learned = learned or f.settings.law == 'kalman'
+        assert learned or np.nanmax(np.abs(np.append(out, 0.0))) < 10.0
+
+
+@pytest.mark.parametrize('order', [1, 2])
+def test_random_stamps_leave_fmin_in_force(order):
+    """At random within 100 s the mean interval is 33 s: 0.45 of that rate is 0.014 Hz."""
+    f = AdaptiveLowPass(order=order)
+    f.filter(100.0 * np.random.default_rng(4).random(3000), np.ones(3000), 0.3)
+    assert f.highest < 0.1 and f.cutoff == 20.0
+
+
+def test_a_slow_signal_is_followed_at_fmin():
+    """10 Hz: 0.45 of the rate is 4.5 Hz; many at once are as one by one."""
+    t, x = 0.1 * np.arange(600), np.sin(np.arange(600))
+    one, many = AdaptiveLowPass(), AdaptiveLowPass()
+    out = np.array([one.filter(*pair, 0.3) for pair in zip(t, x)])
+    assert many.filter(t, x, 0.3) == pytest.approx(out, abs=1e-9)
+    assert many.cutoff == one.cutoff == 20.0 and one.highest == pytest.approx(4.5)
+
 
 NAN = math.nan
 BOUND = {1: 1.0, 2: 1.0 / math.tanh(0.5 * math.pi)}
