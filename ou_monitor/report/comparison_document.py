@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.comparison.compare import Agreement, LEVEL, Likeness
@@ -50,7 +52,7 @@ def _answer(found: Agreement) -> list[str]:
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Likeness.LOOKS_LIKE_IT:
         # Without load changes the mean path is at most a drift, and not worth a sentence.
-        path = [] if found.fall is None or not found.explained > 0.0 else [
+        path = [] if not (found.of('answer') and found.explained > 0.0) else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
         rows = _rows(found)
         outside = [name.split(', ')[0] for name, _, _, remark in rows if remark]
@@ -66,13 +68,14 @@ def _answer(found: Agreement) -> list[str]:
 def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
     """Return quantity, measured, simulated with its 95 % band, and a remark."""
     out = []
-    for name, unit, digits, of in found.rows():
+    for row in found.rows:
         # Levels in V, differences in mV.
-        factor, unit = (1e3, 'mV') if (unit, digits) == ('V', 3) else (1.0, unit)
+        factor, unit = (1e3, 'mV') if (row.unit, row.digits) == ('V', 3) else (1.0, row.unit)
         measured, low, median, high = (
-            number(factor * x, digits) for x in (of.measured, of.low, of.median, of.high))
-        out.append((f'{name}, {unit}'.removesuffix(', '), measured, f'{median}\n[{low}, {high}]',
-                    '' if of.inside else 'outside'))
+            number(factor * x, row.digits)
+            for x in (row.measured, row.low, row.median, row.high))
+        out.append((f'{row.name}, {unit}'.removesuffix(', '), measured,
+                    f'{median}\n[{low}, {high}]', '' if row.inside else 'outside'))
     return out
 
 
@@ -102,8 +105,8 @@ def _voltage(found: Agreement) -> Plot:
     plot.band(at.at - begin, at.low, at.high, 'simulated, 95 %', _SIMULATED)
     plot.line(t, at.simulated, 'one simulation', _SIMULATED, 'faint')
     plot.line(t, at.voltage, 'measured', 0)
-    for level in found.levels:
-        plot.level(t, level, '', _MEASURED)
+    for row in found.of('dips'):
+        plot.level(t, row.at[0], '', _MEASURED)
     return plot
 
 
@@ -126,11 +129,11 @@ def _others(found: Agreement) -> list[Part]:
 
 
 def _spectrum(found: Agreement) -> Plot:
-    middle = np.array([one.middle_hz for one in found.spectrum])
-    power = [one.rms for one in found.spectrum]
+    power = found.of('spectrum')
+    middle = np.array([math.sqrt(row.at[0] * row.at[1]) for row in power])
     plot = Plot('Rms by frequency band', 'frequency, Hz', 'rms, V', height=220,
                 log_x=True, log_y=True)
     plot.bars(middle, np.array([one.low for one in power]), np.array([one.high for one in power]),
               'simulated, 95 %', _SIMULATED)
     plot.markers(middle, np.array([one.measured for one in power]), 'measured', 0)
-    return plot.limits((found.spectrum[0].low_hz, found.spectrum[-1].high_hz))
+    return plot.limits((power[0].at[0], power[-1].at[1]))

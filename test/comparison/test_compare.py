@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.comparison.compare import (
-    band, between_codes, compare, Difference, differences, judge, Likeness, Yardstick)
+    Agreement, between_codes, compare, judge, Likeness, Row, Yardstick)
 from ou_monitor.comparison.flight_model import (
     _sag_error, damping, fit_flight, fit_noise, FlightNoise, Readings)
 from ou_monitor.errors import InputError
@@ -92,12 +92,12 @@ def test_a_doubled_sigma_differs():
                     SupplyModel((OU(ALPHA, 2.0 * SIGMA, LEVEL),)), seeds=40)
     assert found.verdict is Likeness.DIFFERS
     assert found.worst.startswith('Largest difference:')
-    top = found.spectrum[-1].rms
+    top = found.of('spectrum')[-1]
     # 2000 ordinates: 2 % each for the recording and for the median.
     assert (top.median / top.measured) ** 2 == pytest.approx(4.0, rel=0.15)
     assert found.as_data()['spectrum'][-1]['simulated_over_measured'] == pytest.approx(
         (top.median / top.measured) ** 2)
-    assert found.line is None
+    assert not found.of('line')
 
 
 def test_a_line_that_the_simulation_lacks_is_a_difference():
@@ -105,9 +105,10 @@ def test_a_line_that_the_simulation_lacks_is_a_difference():
     one = drawn(3)
     line = 0.06 * math.sqrt(2.0) * np.sin(2.0 * np.pi * 17.3 * one.t)
     found = compare(replace(one, voltage=one.voltage + line), model(), seeds=40)
-    assert found.line.middle_hz == pytest.approx(17.3, abs=0.1)
-    assert found.line.rms.measured == pytest.approx(0.06, rel=0.1) and not found.line.rms.inside
-    assert found.line.rms.high < 0.02
+    row, = found.of('line')
+    assert row.at[0] == pytest.approx(17.3, abs=0.1)
+    assert row.measured == pytest.approx(0.06, rel=0.1) and not row.inside
+    assert row.high < 0.02
 
 
 def test_a_faster_discharge_is_the_cause_of_lower_dips():
@@ -149,7 +150,7 @@ def test_the_second_half_follows_from_the_first():
     assert found.verdict is Likeness.LOOKS_LIKE_IT
     assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
     assert found.explained > 0.9
-    assert found.lowest.inside and all(dips.inside for dips in found.dips)
+    assert found.lowest.inside and all(dips.inside for dips in found.of('dips'))
     # What is farthest off is named, too, though it is within chance.
     assert found.words
     assert found.farthest in ('lowest', 'dips', 'level', 'answer', 'spectrum', 'ks')
@@ -304,8 +305,9 @@ def test_a_coarse_adc_may_have_any_offset(offset):
     t, step = np.arange(12000) / 100.0, 0.03
     v = rail.simulate(t, np.random.default_rng(3))
     found = compare(Recording(t, step * (np.rint(v / step - offset) + offset)), rail, seeds=20)
-    assert found.verdict is Likeness.LOOKS_LIKE_IT and found.apart.measured < found.apart.high
-    assert all(one.low / 1.2 < one.measured < 1.2 * one.high for one in found.dips)
+    ks, = found.of('ks')
+    assert found.verdict is Likeness.LOOKS_LIKE_IT and ks.measured < ks.high
+    assert all(one.low / 1.2 < one.measured < 1.2 * one.high for one in found.of('dips'))
 
 
 def test_held_samples_count_once():
@@ -316,8 +318,9 @@ def test_held_samples_count_once():
     one, other = (compare(each, model(), seeds=20) for each in (slow, fast))
     assert any('repeats its last value' in note for note in other.notes)
     # But for the first reading, whose begin is not in the recording.
-    assert other.dips[1].measured == pytest.approx(one.dips[1].measured, rel=0.1)
-    assert other.dips[1].median == pytest.approx(one.dips[1].median, rel=0.4)
+    one, other = (each.of('dips')[1] for each in (one, other))
+    assert other.measured == pytest.approx(one.measured, rel=0.1)
+    assert other.median == pytest.approx(one.median, rel=0.4)
 
 
 @pytest.mark.parametrize('change, words', [
@@ -344,15 +347,19 @@ def test_recordings_that_cannot_be_compared_are_refused():
 
 
 def test_numbers_outside_their_bands_are_named_beside_the_verdict():
-    found = compare(drawn(1), model())
-    low = found.lowest
-    far = replace(found, verdict=Likeness.LOOKS_LIKE_IT,
-                  lowest=replace(low, measured=low.high + 1.0))
+    found = replace(compare(drawn(1), model()), verdict=Likeness.LOOKS_LIKE_IT)
+
+    def outside(*kinds: str) -> Agreement:
+        """Return it with these kinds above their bands, and the others at the median."""
+        return replace(found, rows=tuple(replace(
+            row, measured=row.high + 1.0 if row.kind in kinds else row.median)
+            for row in found.rows))
+
+    far = outside('lowest')
     said = ' '.join(_answer(far))
     assert 'Outside their own bands' in said and 'lowest voltage' in said.split('Outside')[1]
     assert 'chance allows this' in said and 'within chance' in far.worst
-    many = replace(far, dips=tuple(replace(one, measured=one.high + 1.0) for one in far.dips),
-                   mean=replace(far.mean, measured=far.mean.high + 1.0))
+    many = outside('lowest', 'level', 'dips', 'answer')
     # No chance is claimed for what chance does not explain.
     assert 'within chance' not in many.worst + str(_path(many))
     assert 'only in part' in _answer(many)[0] and 'distribution (KS distance)' in {
@@ -372,7 +379,7 @@ def test_falls_of_white_noise_are_counted_as_theory_says():
     """Of independent samples p below and q above by the noise: p q / (p + q) falls a sample."""
     noise = white(1)
     found = Yardstick(noise, 0.0).measure(noise.voltage)
-    for share, dips in zip((0.01, 0.05), found.dips):
+    for share, dips in zip((0.01, 0.05), found.numbers[2:4]):
         above = norm.sf(norm.ppf(share) + 1.0)
         expected = share * above / (share + above) * RATE * 60.0
         # The count is nearly Poisson; the level is the sample's own quantile, which helps.
@@ -384,8 +391,19 @@ def test_the_level_is_off_by_the_bias_of_the_path():
     noise = white(3)
     yardstick = Yardstick(noise, 0.0)
     own, other = (yardstick.measure(noise.voltage + x) for x in (0.0, 0.03))
-    level = differences(yardstick, own, [other] * 20, 1.0, [-0.019] * 3)[1]
-    assert level.kind == 'level' and ' 19 mV too low' in level.words(level.band)
+    level = yardstick.rows(own, [other] * 20, [-0.019] * 3)[1]
+    assert level.kind == 'level' and ' 19 mV too low' in level.words
+
+
+def test_a_line_in_one_half_is_none():
+    """A line of 60 mV in noise of 100 mV is one if it lasts, as a tone of a converter does."""
+    noise = white(8)
+    line = 0.06 * np.sin(2.0 * np.pi * 17.3 * noise.t)
+    for there, count in ((noise.t > 0.0, 1), (noise.t < 0.5 * noise.t[-1], 0)):
+        v = noise.voltage + line * there
+        yardstick = Yardstick(replace(noise, voltage=v), 0.0)
+        rows = yardstick.rows(yardstick.measure(v), [yardstick.measure(v)] * 20, [0.0] * 3)
+        assert sum(row.kind == 'line' for row in rows) == count
 
 
 def test_a_fall_is_a_dip_of_the_facts():
@@ -396,7 +414,7 @@ def test_a_fall_is_a_dip_of_the_facts():
     own = Recording(samples.t, v, u)
     levels = (4.75, 5.0)
     yardstick = Yardstick(Readings(own.t, v, u), 0.0, levels)
-    counts = yardstick.measure(v).dips[:2] * yardstick.minutes
+    counts = yardstick.measure(v).numbers[2:4] * (own.t[-1] - own.t[0]) / 60.0
     assert counts.tolist() == pytest.approx([supply_facts(own, x).dips.count for x in levels])
     crossings = [np.count_nonzero((v[:-1] >= x) & (v[1:] < x)) for x in levels]
     assert np.all(counts < 0.8 * np.array(crossings)) and np.all(counts > 0)
@@ -406,9 +424,11 @@ def test_white_noise_has_equal_power_in_equal_bands():
     """A flat spectrum: each band has its share of the variance."""
     noise = white(2)
     yardstick = Yardstick(noise, 0.0)
-    power = yardstick.measure(noise.voltage).power
-    widths = np.diff(yardstick.bands)
-    assert power[2:] == pytest.approx(0.01 * widths[2:] / (0.5 * RATE), rel=0.15)
+    own = yardstick.measure(noise.voltage)
+    bands = [row for row in yardstick.rows(own, [own] * 20, [0.0] * 3) if row.kind == 'spectrum']
+    for row in bands[2:]:
+        assert row.measured ** 2 == pytest.approx(
+            0.01 * (row.at[1] - row.at[0]) / (0.5 * RATE), rel=0.15)
 
 
 def test_levels_lie_between_codes():
@@ -419,6 +439,7 @@ def test_levels_lie_between_codes():
     coarse = Readings(coarse.t, 0.1 * np.rint(coarse.voltage / 0.1), None)
     levels = Yardstick(coarse, 0.1).levels
     assert np.allclose(np.mod(np.array(levels) / 0.1, 1.0), 0.5)
+    assert len(levels) == len(set(levels))
 
 
 def test_the_mean_response_to_rises_is_measured():
@@ -436,43 +457,46 @@ def test_the_mean_response_to_rises_is_measured():
     assert not Yardstick(Readings(t, v, None), 0.0).measure(v).response.size
 
 
+def row(kind: str, measured: float, simulated: np.ndarray, least: float = 1e-9) -> Row:
+    """Return a row whose wording is its kind."""
+    return Row(kind, kind, 'V', 3, measured, simulated, least, kind)
+
+
 def test_the_worst_is_the_farthest_in_half_bands():
     seeds = np.random.default_rng(4).standard_normal(400)
-
-    def of(kind: str, measured: float, least: float = 1e-9) -> Difference:
-        return Difference(kind, measured, seeds, least, lambda b: kind)
-
-    level = of('level', 0.0)
-    p, _, worst, kind = judge([of('lowest', 4.0), of('spectrum', 6.0), level], 0.9, True)
-    # 6 at half the weight is less than 4.
+    level = row('level', 0.0, seeds)
+    p, _, worst, kind = judge(
+        [row('lowest', 4.0, seeds), row('line', 4.5, seeds), level], 0.9, True)
+    # 4.5 at 0.8 of the weight is less than 4.
     assert worst == kind == 'lowest'
     assert p == pytest.approx(1.0 / 401.0)
-    p, *_ = judge([of('lowest', 0.0), level], 0.9, True)
+    p, *_ = judge([row('lowest', 0.0, seeds), level], 0.9, True)
     assert p > 0.9
     # A band that is wide by what a pilot would not notice.
-    wide = of('lowest', 4.0, least=100.0)
-    assert judge([wide, of('level', 0.0, least=100.0)], 0.9, True)[0] == pytest.approx(1.0 / 401.0)
+    wide = row('lowest', 4.0, seeds, least=100.0)
+    assert judge([wide, row('level', 0.0, seeds, 100.0)], 0.9, True)[0] == pytest.approx(
+        1.0 / 401.0)
     assert wide.scores()[0] == pytest.approx(0.04, rel=0.1)
-    found = band(2.5, seeds)
+    found = row('lowest', 2.5, seeds)
     assert (found.low, found.high) == pytest.approx((-1.96, 1.96), abs=0.35)
-    assert not found.inside
+    assert not found.inside and found.outside[1:].mean() == pytest.approx(0.05, abs=0.01)
+    # A spectrum is judged by the logarithm of its power.
+    power = row('spectrum', 2.0, np.exp(seeds))
+    assert power.scores() == pytest.approx(0.5 / 0.8 * row(
+        'level', 2.0 * math.log(2.0), 2.0 * seeds).scores())
 
 
 def test_the_verdict_follows_from_path_and_level():
     """Nothing looks alike whose path is worse than a constant, or whose mean is off its band."""
     seeds = np.random.default_rng(5).standard_normal(400)
-
-    def of(kind: str, measured: float) -> Difference:
-        return Difference(kind, measured, seeds, 1e-9, lambda b: kind)
-
     # Twelve others at once: at 1.1 half-bands from the median the level alone is no oddity.
-    others = [Difference('lowest', 0.0, np.random.default_rng(k).standard_normal(400), 1e-9,
-                         lambda b: 'lowest') for k in range(12)]
+    others = [row('lowest', 0.0, np.random.default_rng(k).standard_normal(400))
+              for k in range(12)]
     looks, differs = Likeness.LOOKS_LIKE_IT, Likeness.DIFFERS
     at = [(0.0, 0.1, True, looks), (0.0, -0.1, False, looks), (0.0, -0.1, True, differs),
           (2.2, 0.1, True, differs)]
     for level, explained, moved, verdict in at:
-        p, said, words, kind = judge([*others, of('level', level)], explained, moved)
+        p, said, words, kind = judge([*others, row('level', level, seeds)], explained, moved)
         assert p > 0.05 and said is verdict
     assert words == kind == 'level'
 
@@ -484,11 +508,11 @@ def test_a_recording_is_the_farthest_as_often_as_each_simulation():
     rng, farthest, outside = np.random.default_rng(3), 0, 0
     for _ in range(600):
         x = rng.standard_normal((4, 21))
-        p, *_ = judge([Difference(kind, row[0], row[1:], 1e-12, lambda b: '') for kind, row in zip(
-            ('lowest', 'level', 'spectrum', 'ks'), x)], 1.0, True)
+        p, *_ = judge([row(kind, one[0], one[1:]) for kind, one in zip(
+            ('lowest', 'level', 'dips', 'ks'), x)], 1.0, True)
         farthest += p < 1.5 / 21.0
         y = rng.standard_normal(51)
-        outside += not band(y[0], y[1:]).inside
+        outside += not row('level', y[0], y[1:]).inside
     assert abs(farthest - 28.6) < 4.0 * 5.2
     assert abs(outside - 30.0) < 4.0 * 5.3
 
