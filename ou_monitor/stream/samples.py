@@ -118,10 +118,8 @@ class Publishers:
 
     def follow(self, numbers: list[int | None], times: FloatArray, arrived: FloatArray,
                publishers: int) -> npt.NDArray[np.bool_]:
-        """Return which messages (numbers; times of sending and arrival, s) to keep."""
+        """Return which messages, at least one, to keep (times of sending and arrival, s)."""
         kept = np.ones(len(numbers), dtype=np.bool_)
-        if not numbers:
-            return kept
         whole = [number for number in numbers if number is not None]
         if len(whole) < len(numbers):
             self.numbered = False

@@ -237,14 +237,10 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
 
 
 def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
-    rows: list[list[str]] = []
-    for line in lines:
-        try:
-            rows.append([cell.strip() for cell in next(csv.reader(
-                _prepared([line], delimiter, comma, mark), delimiter=delimiter,
-                skipinitialspace=True), [])])
-        except csv.Error:
-            rows.append([])
+    # Line by line, so that an open quote takes no other line with it.
+    rows = [[cell.strip() for cell in next(csv.reader(
+        _prepared([line], delimiter, comma, mark), delimiter=delimiter, skipinitialspace=True),
+        [])] for line in lines]
     if comma and delimiter == ',':
         half = _names_half(rows)
         return [_joined(row, half) or list(map(_with_point, row)) for row in rows]
