@@ -364,17 +364,16 @@ class ColumnBuffer:
     def add(self, part: FieldColumn) -> None:
         """Append a part."""
         for k, (view, piece) in enumerate(zip(self._views, part)):
-            if k in self._stores or not piece.size:
-                pass
-            elif not piece.strides[0] and (
-                    not view.size or np.array_equal(view[:1], piece[:1], equal_nan=True)):
-                self._views[k] = np.broadcast_to(piece[0], view.size + piece.size)
-                continue
-            else:
-                self._stores[k] = mmap.mmap(-1, mmap.PAGESIZE, mmap.MAP_PRIVATE)
-                _append(self._stores[k], view)
-            if piece.size:
-                _append(self._stores[k], piece)
+            store = self._stores.get(k)
+            if store is None and piece.size:
+                if not piece.strides[0] and (
+                        not view.size or np.array_equal(view[:1], piece[:1], equal_nan=True)):
+                    self._views[k] = np.broadcast_to(piece[0], view.size + piece.size)
+                    continue
+                store = self._stores[k] = mmap.mmap(-1, mmap.PAGESIZE, mmap.MAP_PRIVATE)
+                _append(store, view)
+            if store is not None:
+                _append(store, piece)
 
     def whole(self) -> FieldColumn:
         """Return all parts as one."""
