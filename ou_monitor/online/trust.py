@@ -366,16 +366,11 @@ class InputTrust:
                 'set the lowest voltage that the load tolerates.')
         usual = float(np.median(np.abs(self._recent))) if self._recent.size else NAN
         if usual > MOST_SUPPLY or usual > _UNIT * limit:
+            ratio = usual / limit
+            unit = ', as hundredths of a volt would' if ratio < 5.0 * _UNIT else (
+                ', as millivolts would' if ratio < 1e4 else '')
             return Doubt.UNIT, (
-                f'The voltage reads {usual:.4g} V, {usual / limit:.3g} times brownout.voltage '
-                f'({limit:g} V){_unit_of(usual / limit)}: set unit_factor in the msg_config, '
-                'or brownout.voltage.')
+                f'The voltage reads {usual:.4g} V, {ratio:.3g} times brownout.voltage '
+                f'({limit:g} V){unit}: set unit_factor in the msg_config, or brownout.voltage.')
         why = self._still.why
         return (Doubt.STUCK, why) if why else (Doubt.NONE, '')
-
-
-def _unit_of(ratio: float) -> str:
-    """Return the likely unit of readings at this ratio to the limit."""
-    if ratio < 0.5 * _UNIT * 10.0:
-        return ', as hundredths of a volt would'
-    return ', as millivolts would' if ratio < 1e4 else ''

@@ -238,18 +238,14 @@ class SlidingEstimator:
         if t.size:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _ROUNDING) * self._window)
 
-    def _examine(self) -> Quality:
-        """Return the quality of the raw samples, examined again several times per window."""
-        if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
-            self._quality = examine(self._tail, self._line.period)
-            self._looked = self._line.newest
-        return self._quality
-
     def _estimate(self) -> Estimate:
         line, kept = self._line, self._kept.columns
         at = int(kept[0].searchsorted(self._begin))
         t, y, u = kept[:, at:]
-        quality = self._examine() if t.size else self._quality
+        if t.size and not 0.0 <= line.newest - self._looked < self._window / _LOOKS:
+            self._quality = examine(self._tail, line.period)
+            self._looked = line.newest
+        quality = self._quality
         counters = line.counters
         if not t.size:
             waiting = self._thinner.waiting(line.newest - self._window)

@@ -66,11 +66,6 @@ def phase_lag(order: int, cutoff: float, frequency: float) -> float:
     return math.degrees(math.atan2(_ROOT2 * ratio, 1.0 - ratio * ratio))
 
 
-def delay(lag: float, frequency: float) -> float:
-    """Return the phase delay, s, of a `lag` in degrees at `frequency`, Hz."""
-    return lag / (360.0 * frequency)
-
-
 def most_lag(order: int) -> float:
     """Return the limit that the lag of a low-pass approaches, degrees."""
     return 90.0 * order

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ou_monitor.online.filter.cutoff import (
     Bound, CutoffControl, OF_RATE, SampleInterval, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import (
-    cutoff_for_lag, delay, LowPassState, most_lag, phase_lag)
+    cutoff_for_lag, LowPassState, most_lag, phase_lag)
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
@@ -115,22 +115,18 @@ class AdaptiveLowPass:
         of equal lag.
         """
         by_lag = self._equivalent_cutoff()
-        return self._within_limits(by_lag) if by_lag == by_lag else self._control.cutoff
+        return by_lag if by_lag == by_lag else self._control.cutoff
 
     @property
     def wanted(self) -> float:
         """Cutoff that the law requests, within fmin..fmax, Hz; NaN if unknown."""
         by_lag = self._equivalent_cutoff()
-        return self._within_limits(by_lag) if by_lag == by_lag else self._control.wanted
+        return by_lag if by_lag == by_lag else self._control.wanted
 
     @property
     def highest(self) -> float:
         """Highest cutoff that the sample rate allows, Hz; inf while the rate is unknown."""
         return OF_RATE / self._interval.mean if self._interval.mean > 0.0 else math.inf
-
-    def _within_limits(self, cutoff: float) -> float:
-        s = self._settings
-        return min(max(cutoff, s.lowest), s.fmax)
 
     @property
     def bound(self) -> Bound:
@@ -155,7 +151,7 @@ class AdaptiveLowPass:
     @property
     def delay(self) -> float:
         """Phase delay of the present filter at `lag_frequency`, s."""
-        return delay(self.phase_lag, self._settings.lag_frequency)
+        return self.phase_lag / (360.0 * self._settings.lag_frequency)
 
     def configure(self, **options: object) -> None:
         """
@@ -337,14 +333,14 @@ class AdaptiveLowPass:
         return self._wanted
 
     def _equivalent_cutoff(self) -> float:
-        """Return the cutoff of the low-pass with the lag of the Kalman filter, Hz."""
+        """Return the cutoff, within fmin..fmax, that lags like the Kalman filter, Hz."""
         s = self._settings
         if self._kalman is None or not self._known:
             return NAN
         lag, mean = self._kalman.lag, self._interval.mean
         if lag != lag:
             return NAN
-        highest = OF_RATE / mean if mean > 0.0 else s.fmax
-        if lag <= phase_lag(s.order, highest, s.lag_frequency):
-            return highest
-        return cutoff_for_lag(s.order, min(lag, 0.999 * most_lag(s.order)), s.lag_frequency)
+        found = OF_RATE / mean if mean > 0.0 else s.fmax
+        if lag > phase_lag(s.order, found, s.lag_frequency):
+            found = cutoff_for_lag(s.order, min(lag, 0.999 * most_lag(s.order)), s.lag_frequency)
+        return min(max(found, s.lowest), s.fmax)

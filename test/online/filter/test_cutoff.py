@@ -147,22 +147,11 @@ def test_starts_at_the_first_wanted_and_follows():
     assert line(control(), [100.0, 50.0, 50.0]) == [100.0, 50.0, 50.0]
 
 
-def test_starts_at_the_fallback_when_nothing_is_known():
-    made = control(fallback=60.0)
-    assert line(made, [NAN, NAN]) == [60.0, 60.0] and made.bound is Bound.FALLBACK
-
-
 def test_limits_saturate_and_say_which():
     made = control()
     assert line(made, [1.0]) == [20.0] and made.bound is Bound.LOWEST
     assert line(made, [1e6]) == [150.0] and made.bound is Bound.HIGHEST
     assert line(made, [70.0]) == [70.0] and made.bound is Bound.NONE
-
-
-def test_the_lowest_cutoff_follows_from_the_lag():
-    """45 degrees at 10 Hz with order 1: 10 Hz."""
-    made = control(order=1, max_lag=45.0)
-    assert line(made, [1.0]) == [pytest.approx(10.0)] and made.bound is Bound.LAG
 
 
 def test_the_sample_rate_bounds_down_to_the_lowest():
@@ -202,14 +191,6 @@ def test_slew_limits_octaves_per_second():
     assert got[:50] == pytest.approx(list(150.0 * 2.0 ** (-0.04 * np.arange(1, 51))))
     assert got[50:] == pytest.approx([37.5] * 10)
     assert line(made, [150.0])[0] < 40.0 and made.bound is Bound.SLEW
-
-
-def test_the_fallback_is_reached_within_the_slew_too():
-    made = control(slew=4.0, fallback=75.0)
-    line(made, [150.0])
-    got = line(made, [NAN] * 30)
-    assert got[0] == pytest.approx(150.0 * 2.0 ** -0.04)
-    assert made.cutoff == 75.0 and made.bound is Bound.FALLBACK
 
 
 def test_dead_band_holds_and_then_follows():

@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import AdaptiveLowPass
 from ou_monitor.online.filter.cutoff import Bound, relative_cutoff
-from ou_monitor.online.filter.filter_state import cutoff_for_lag, delay, LowPassState, phase_lag
+from ou_monitor.online.filter.filter_state import cutoff_for_lag, LowPassState, phase_lag
 from ou_monitor.online.settings import FILTER_PARAMETERS, FilterSettings
 import pytest
 from scipy import integrate, signal
@@ -85,7 +85,6 @@ def test_lag_is_that_of_the_filter(order, fc):
     response = signal.freqs(*analog(order, fc, 'lowpass'), worN=[20.0 * math.pi])[1][0]
     lag = phase_lag(order, fc, 10.0)
     assert lag == pytest.approx(-math.degrees(np.angle(response)))
-    assert delay(lag, 10.0) == pytest.approx(lag / 3600.0)
     assert cutoff_for_lag(order, lag, 10.0) == pytest.approx(fc)
 
 
