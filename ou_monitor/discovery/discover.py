@@ -289,7 +289,7 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     elif relaxes(ou.alpha, duration) and not any(
             model.has(name) for name in ('ac_coupling', 'load_sag', 'drift')):
         # A lasting sag or drift would rule out an AC coupling.
-        notes.append(coupling_note(ou.alpha, duration))
+        notes.append(coupling_note(ou.alpha, duration, samples.n))
     return tuple(notes)
 
 

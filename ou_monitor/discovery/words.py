@@ -8,6 +8,7 @@ import math
 import re
 from typing import Any
 
+from ou_monitor.discovery import decision
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
@@ -153,11 +154,11 @@ def left_out_note(count: int, scored: int) -> str:
             f'a model fitted to the rest does not apply. Only the other {scored} are scored.')
 
 
-def coupling_note(alpha: float, duration: float) -> str:
-    """Return for which rails an AC coupling is not ruled out (alpha in 1/s, duration in s)."""
+def coupling_note(alpha: float, duration: float, n: int) -> str:
+    """Return for which rails an AC coupling is not ruled out (1/s, s, number of samples)."""
     # A recording of duration T gives 0.24 alpha T nats of evidence for an AC coupling, where alpha
-    # is the rate of the supply.  Below 6 nats, the coupling is not ruled out.
-    slowest = 0.24 * duration / 6.0
+    # is the rate of the supply, before the penalty of its parameter (BIC).
+    slowest = 0.24 * duration / (decision.ACCEPT + 0.5 * math.log(n))
     return (f'If the supply itself takes more than {number(slowest)} s to relax, the '
             'relaxation found could come from an AC-coupled instrument (a high-pass at '
             f'{number(alpha / (2.0 * math.pi))} Hz); a DC-coupled recording would settle it.')

@@ -157,9 +157,9 @@ def test_the_verdict_says_what_is_left_or_refused():
     assert verdict_words(refused)[-1].startswith('It is worse: trust the named causes')
     assert plain_words('throttle change over 2 s') == plain_words('throttle')
     assert plain_words('order line') != plain_words('line')
-    # 0.24 alpha T = 6 nats; a corner is a rate over a turn.
-    note = coupling_note(20.0 * math.pi, 100.0)
-    assert 'more than 4.00 s' in note and 'high-pass at 10.0 Hz' in note
+    # 0.24 alpha T = 4 nats + 0.5 ln n; a corner is a rate over a turn.
+    note = coupling_note(20.0 * math.pi, 100.0, round(math.exp(8.0)))
+    assert 'more than 3.00 s' in note and 'high-pass at 10.0 Hz' in note
 
 
 @pytest.mark.parametrize('gain, error, text', [
