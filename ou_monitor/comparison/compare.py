@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.noise import dip_begins, noise_of, remainder, rise_that_ends
-from ou_monitor.comparison.flight_model import FiledModel, fit_flight, FlightModel, MOVES, Readings
+from ou_monitor.comparison.flight_model import (
+    file_simulator, fit_flight, FlightModel, MOVES, Readings)
 from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, on_time, usable, why_no_model
@@ -447,16 +448,20 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     samples, offset = _samples(recording, notes)
     duration = float(samples.t[-1])
     begin = _start_index(samples, fit_until, fitted=model is None)
+    late: list[str] = []
+    if samples.current is not None:
+        current, sign = on_time(samples.t, samples.voltage, samples.current, 'current', late)
+        samples = replace(samples, current=current * (sign if model is None else 1.0))
     if model is None:
-        if samples.current is not None:
-            current, sign = on_time(samples.t, samples.voltage, samples.current, 'current', notes)
-            samples = replace(samples, current=sign * current)
-        fitted = fit_flight(samples.part(slice(0, begin)), lambda share: report(0.6 * share))
-        simulator: FlightModel | FiledModel = fitted
-        notes += _fit_notes(fitted, samples)
+        fitted = fit_flight(samples.part(slice(0, begin)))
+        names, draw = fitted.names, fitted.simulator(samples)
+        notes += (late if fitted.fits[0].load is Load.CURRENT else []) + _fit_notes(
+            fitted, samples)
+        report(0.3)
     else:
-        samples = _checked_load(model, samples, recording.name, notes)
-        simulator = FiledModel(model)
+        _check_load(model, samples, recording.name)
+        names, draw = [term.NAME for term in model.terms], file_simulator(model, samples)
+        notes += late if model.full_current else []
         notes.append('The errors of the parameters in the model file are not simulated: the '
                      'bands include only the noise.')
     part = slice(begin, samples.t.size)
@@ -473,19 +478,19 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     shifts = np.zeros(seeds)
     stride = max(1, -(-own.t.size // _PLOTTED))
     # A model from a file has the level of another flight.
-    aligned, before = None, 0.6
+    aligned = None
     if model is not None:
-        drawn, before = [], 0.3
+        drawn = []
         for k in range(_FEWEST_SEEDS):
-            drawn.append(simulator.draw(samples, np.random.default_rng((seed, k)))[part][::stride])
-            report(before * (k + 1) / _FEWEST_SEEDS)
+            drawn.append(draw(np.random.default_rng((seed, k)))[part][::stride])
+            report(0.3 * (k + 1) / _FEWEST_SEEDS)
         aligned = _beginning(own.t, np.array(drawn), stride)
     measured: list[Measures] = []
     traces = np.empty((seeds, own.voltage[::stride].size), dtype=np.float32)
     total, first = np.zeros(own.t.size), own.voltage
     strays = 0
     for k in range(seeds):
-        v = simulator.draw(samples, rng)[part]
+        v = draw(rng)[part]
         if not np.isfinite(v).all():
             raise InputError('the model diverges over this throttle: its voltage is not finite')
         if aligned is not None:
@@ -498,7 +503,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         strays += stray(v, samples.voltage) > 0.0
         measured.append(yardstick.measure(v))
         traces[k] = v[::stride]
-        report(before + (1.0 - before) * (k + 1.0) / seeds)
+        report(0.3 + 0.7 * (k + 1.0) / seeds)
     if aligned is not None:
         notes.append(f'The level of the model was moved by {number(float(shifts.mean()), 3)} V '
                      f'(+- {number(float(shifts.std()), 2)} V), so that the mean of the first '
@@ -521,7 +526,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         [one.response for one in measured], [_LOW, _HIGH], axis=0)
     return Agreement(
         recording.name, (0.0, float(own.t[0]) if model is None else 0.0),
-        (float(own.t[0]), duration), tuple(simulator.names),
+        (float(own.t[0]), duration), tuple(names),
         explained, math.sqrt(float(np.mean(error ** 2))), round(float(error.mean()), 12),
         thirds, tuple(rows), int(yardstick.rises.size), p, verdict, words, farthest, tuple(notes),
         Traces(own.t + offset, own.voltage,
@@ -602,16 +607,11 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
             'simulated.']
 
 
-def _checked_load(model: SupplyModel, samples: Readings, name: str, notes: list[str]
-                  ) -> Readings:
-    """Return the readings with late current corrected; InputError if the load is missing."""
+def _check_load(model: SupplyModel, samples: Readings, name: str) -> None:
+    """Raise InputError if the load of the model is missing."""
     needs = model.needs_throttle
-    if model.full_current:
-        if needs and samples.current is None:
-            raise InputError(f"the load of the model is a current, and '{name}' has none")
-        return samples if samples.current is None else replace(samples, current=on_time(
-            samples.t, samples.voltage, samples.current, 'current', notes)[0])
-    if needs and samples.throttle is None:
+    if needs and model.full_current and samples.current is None:
+        raise InputError(f"the load of the model is a current, and '{name}' has none")
+    if needs and not model.full_current and samples.throttle is None:
         raise InputError(f"the model's term '{needs[0]}' needs throttle, and the recording has "
                          'none')
-    return samples

@@ -181,50 +181,47 @@ class FlightModel:
 
     def path(self, samples: Readings) -> FloatArray:
         """Return the mean voltage, V."""
-        paths = np.array([_path(fit, samples) for fit in self.fits])
-        return self.damping.of(self.odds @ paths, samples.t)
+        return self.damping.of(_mean_path(self.fits, self.odds, samples), samples.t)
 
-    def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
-        """Return one simulated voltage, V; the errors of the parameters are drawn too."""
+    def simulator(self, samples: Readings) -> Callable[[np.random.Generator], FloatArray]:
+        """Return a function that draws one simulated voltage, V, with errors of the parameters."""
         t, fitted = samples.t, samples.t <= self.until
-        fit = self.fits[int(rng.random() >= self.odds[0])].draw(rng)
-        path = _path(fit, samples)
-        resized = _path(fit.resized(math.exp(self.sag_error * rng.standard_normal())), samples)
-        # The mean over the fitted part is known, so with a larger sag the level is higher.
-        level = float((path - resized)[fitted].mean()) + self.noise.mean_error(
-            self.until) * rng.standard_normal()
-        slow = simulate(t, 1.0 / SLOW_TIME, fit.slow_std * math.sqrt(2.0 / SLOW_TIME), rng)
-        return np.asarray(level + self.damping.of(resized, t) + slow + self.noise.draw(
-            t.size, _load(fit.load, samples), rng))
+        load = _load(self.fits[0].load, samples)
+        rows = self.fits[0].regressors(t, load)
+
+        def draw(rng: np.random.Generator) -> FloatArray:
+            fit = self.fits[int(rng.random() >= self.odds[0])].draw(rng)
+            path = fit.voltage(fit.values, rows)
+            larger = fit.resized(math.exp(self.sag_error * rng.standard_normal()))
+            resized = larger.voltage(larger.values, rows)
+            # The mean over the fitted part is known, so with a larger sag the level is higher.
+            level = float((path - resized)[fitted].mean()) + self.noise.mean_error(
+                self.until) * rng.standard_normal()
+            slow = simulate(t, 1.0 / SLOW_TIME, fit.slow_std * math.sqrt(2.0 / SLOW_TIME), rng)
+            return np.asarray(level + self.damping.of(resized, t) + slow
+                              + self.noise.draw(t.size, load, rng))
+
+        return draw
 
 
 def _load(kind: Load, samples: Readings) -> FloatArray | None:
     return samples.current if kind is Load.CURRENT else samples.throttle
 
 
-def _path(fit: LoadFit, samples: Readings) -> FloatArray:
-    return fit.path(samples.t, _load(fit.load, samples))
+def _mean_path(fits: tuple[LoadFit, ...], odds: FloatArray, samples: Readings) -> FloatArray:
+    load = _load(fits[0].load, samples)
+    return np.asarray(odds @ np.array([fit.path(samples.t, load) for fit in fits]))
 
 
-@dataclass(frozen=True, eq=False)
-class FiledModel:
-    """A model from a file, simulated without repeats and ADC steps."""
-
-    model: SupplyModel
-
-    @property
-    def names(self) -> list[str]:
-        """Return the names of its terms."""
-        return [term.NAME for term in self.model.terms]
-
-    def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
-        """Return one simulated voltage, V."""
-        analogue = SupplyModel(tuple(
-            term for term in self.model.terms
-            if term.NAME not in ('held_samples', Quantization.NAME)))
-        full, current = self.model.full_current, samples.current
-        return analogue.simulate(samples.t, rng, samples.throttle if not full else
-                                 None if current is None else current / full)
+def file_simulator(model: SupplyModel, samples: Readings
+                   ) -> Callable[[np.random.Generator], FloatArray]:
+    """Return a function that draws a voltage, V, of a model, without repeats and ADC steps."""
+    analogue = SupplyModel(tuple(
+        term for term in model.terms if term.NAME not in ('held_samples', Quantization.NAME)))
+    full, load = model.full_current, samples.throttle
+    if full:
+        load = None if samples.current is None else samples.current / full
+    return lambda rng: analogue.simulate(samples.t, rng, load)
 
 
 # Number of parts that are held out in turn.
@@ -237,20 +234,20 @@ _CLEAR = 1.0
 _FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 
 
-def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightModel:
-    """Fit a model to samples: at least 100, over several seconds (report: progress, 0..1)."""
+def fit_flight(samples: Readings) -> FlightModel:
+    """Fit a model to samples: at least 100, over several seconds."""
     fits, odds = _best(samples)
-    report(0.5)
-    held_out, n = [], samples.t.size
-    for j in range(_PARTS if fits[0].load is not Load.NONE else 0):
+    kind, n = fits[0].load, samples.t.size
+    held_out = []
+    for j in range(_PARTS if kind is not Load.NONE else 0):
         part = slice(j * n // _PARTS, (j + 1) * n // _PARTS)
-        fit = _fit(samples, fits[0].load, fits[0].falls, part)
-        held_out.append((_path(fit, samples)[part], samples.voltage[part]))
-    path = odds @ np.array([_path(fit, samples) for fit in fits])
+        fit = _fit(samples, kind, fits[0].falls, part)
+        path = fit.path(samples.t, _load(kind, samples))
+        held_out.append((path[part], samples.voltage[part]))
+    path = _mean_path(fits, odds, samples)
     damped = damping(samples, path)
     noise = fit_noise(samples, samples.voltage - damped.of(path, samples.t),
-                      _load(fits[0].load, samples), fits[0].slow_std ** 2)
-    report(1.0)
+                      _load(kind, samples), fits[0].slow_std ** 2)
     return FlightModel(fits, odds, damped, _sag_error(held_out), noise, float(samples.t[-1]))
 
 

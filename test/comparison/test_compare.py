@@ -280,7 +280,7 @@ def test_both_kinds_of_level_are_simulated_by_their_probability():
     """The mean path is their weighted mean, and of 300 simulations their share has the other."""
     recording = flight(0)
     samples = Readings(recording.t, recording.voltage, recording.throttle)
-    found = fit_flight(samples, lambda share: None)
+    found = fit_flight(samples)
     one, other = found.fits
     assert one.falls is not other.falls
     assert found.odds == pytest.approx(
@@ -293,8 +293,8 @@ def test_both_kinds_of_level_are_simulated_by_their_probability():
         found, odds=np.array([1.0, 0.0])).path(samples) + 0.3 * replace(
         mixed, odds=np.array([0.0, 1.0])).path(samples))
     # 300 draws: 0.3 +- 0.026; 4 of them.
-    part, rng = samples.part(slice(0, 200)), np.random.default_rng(1)
-    high = [mixed.draw(part, rng).mean() > 500.0 for _ in range(300)]
+    draw, rng = mixed.simulator(samples.part(slice(0, 200))), np.random.default_rng(1)
+    high = [draw(rng).mean() > 500.0 for _ in range(300)]
     assert np.mean(high) == pytest.approx(0.3, abs=0.106)
 
 
