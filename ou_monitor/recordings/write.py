@@ -99,7 +99,11 @@ def write_recording(
             whole = stamps.size
             times = stamps
             if blocks:
-                check_steady(piece.name, stamps - first, count, sample_rate)
+                # Blocks hold no stamps of samples: the spacing must be the stated one.
+                grid = (count + np.arange(stamps.size)) * (1e9 / sample_rate)
+                if np.abs(stamps - first - grid).max() > 0.5e9 / sample_rate:
+                    raise InputError(f"'{piece.name}' is not sampled at a steady {sample_rate:g} "
+                                     'Hz, which blocks of samples need: use another type')
                 stamps, volts = np.append(rest[0], stamps), np.append(rest[1], volts)
                 whole = stamps.size - stamps.size % BLOCK
                 rest = stamps[whole:], volts[whole:]
@@ -154,16 +158,6 @@ def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
         raise InputError(f"'{name}' has stamps up to {far * 1e-9:.4g} s, and a bag holds "
                          f'{_LAST_NS * 1e-9:.2g} s: are they in ms or us?')
     return stamps.astype(np.int64)
-
-
-def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
-                 sample_rate: float) -> None:
-    """Refuse a spacing other than the stated one, because blocks hold no stamps of samples."""
-    grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
-    if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:
-        raise InputError(
-            f"'{name}' is not sampled at a steady {sample_rate:g} Hz, which blocks of samples "
-            'need: use another type')
 
 
 def write_log(
