@@ -14,7 +14,7 @@ frequencies q, divided by 2 pi:
 All of these grow with w, so each variance belongs to one cutoff.
 
 White noise: if the input is linear between samples, a step of the filter is
-z' = F z + a x_(k-1) + b x_k (F, a and b come from `LowPassState`).  So for independent
+z' = F z + a x_(k-1) + b x_k (`transition` of `filter_state`).  So for independent
 samples of variance 1, the stationary covariance is
 
     C = F C F^T + a a^T + b b^T + F b a^T + a b^T F^T.
@@ -39,7 +39,7 @@ from functools import cache
 import math
 
 import numpy as np
-from ou_monitor.online.filter.filter_state import LowPassState
+from ou_monitor.online.filter.filter_state import transition
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
@@ -52,31 +52,16 @@ _STILL = 1e-6
 
 def white_noise(mode: str, order: int, angle: float) -> float:
     """Return the output variance for independent samples of variance 1."""
-    (f11, f21), (f12, f22) = (_step(order, angle, y, s, 0.0, 0.0)
-                              for y, s in ((1.0, 0.0), (0.0, 1.0)))
-    (a1, a2), (b1, b2) = (_step(order, angle, 0.0, 0.0, *ends)
-                          for ends in ((1.0, 0.0), (0.0, 1.0)))
+    step = transition(order, angle)
+    f, a, b = step[:, :2], step[:, 2], step[:, 3]
     if mode == 'lowpass':
-        m1, m2 = f11 * b1 + f12 * b2, f21 * b1 + f22 * b2
-        drive = (a1 * a1 + b1 * b1 + 2.0 * m1 * a1, a1 * a2 + b1 * b2 + m1 * a2 + m2 * a1,
-                 a2 * a2 + b2 * b2 + 2.0 * m2 * a2)
+        drive, mixed = np.outer(a, a) + np.outer(b, b), np.outer(f @ b, a)
     else:
-        g1, g2 = a1 + b1, a2 + b2
-        m1, m2 = f11 * g1 + f12 * g2, f21 * g1 + f22 * g2
-        drive = (2.0 * g1 * (g1 - m1), 2.0 * g1 * g2 - m1 * g2 - m2 * g1, 2.0 * g2 * (g2 - m2))
-    # Solve for the three elements of the symmetric C.
-    turned = [[1.0 - f11 * f11, -2.0 * f11 * f12, -f12 * f12],
-              [-f11 * f21, 1.0 - f11 * f22 - f12 * f21, -f12 * f22],
-              [-f21 * f21, -2.0 * f21 * f22, 1.0 - f22 * f22]]
-    return float(np.linalg.solve(turned, drive)[0])
-
-
-def _step(order: int, angle: float, y: float, slope: float, start: float, end: float,
-          ) -> tuple[float, float]:
-    state = LowPassState(y)
-    state.slope = slope
-    state.advance(order, angle, start, end)
-    return state.y, state.slope
+        g = a + b
+        drive, mixed = 2.0 * np.outer(g, g), -np.outer(f @ g, g)
+    # Solve C = F C F^T + drive for the elements of C.
+    return float(np.linalg.solve(
+        np.eye(4) - np.kron(f, f), (drive + mixed + mixed.T).ravel())[0])
 
 
 @cache

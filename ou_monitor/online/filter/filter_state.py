@@ -24,6 +24,9 @@ from __future__ import annotations
 import cmath
 import math
 
+import numpy as np
+from ou_monitor.records import FloatArray
+
 _ROOT2 = math.sqrt(2.0)
 
 
@@ -56,6 +59,17 @@ class LowPassState:
         self.y += (c + s) * off + _ROOT2 * s * slope + rise * (1.0 + c / p)
         self.slope += (c - s) * slope - _ROOT2 * s * off - rise * (c + s) / angle
         return self.y
+
+
+def transition(order: int, angle: float) -> FloatArray:
+    """Return [F a b], (2, 4): y and slope after a step are F (y, slope) + a start + b end."""
+    found = np.empty((2, 4))
+    for k, (y, slope, start, end) in enumerate(np.eye(4).tolist()):
+        one = LowPassState(y)
+        one.slope = slope
+        one.advance(order, angle, start, end)
+        found[:, k] = one.y, one.slope
+    return found
 
 
 def phase_lag(order: int, cutoff: float, frequency: float) -> float:

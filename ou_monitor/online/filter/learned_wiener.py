@@ -43,7 +43,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff import time_constant
-from ou_monitor.online.filter.filter_state import LowPassState, phase_lag, share_for_lag
+from ou_monitor.online.filter.filter_state import phase_lag, share_for_lag, transition
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
@@ -72,14 +72,8 @@ def step_of(key: int) -> FloatArray:
     size = 2 * len(CUTOFFS)
     found = np.zeros((size, size + 2))
     for k, cutoff in enumerate(CUTOFFS):
-        at = 2 * k
-        columns = [(at, 1.0, 0.0, 0.0, 0.0), (at + 1, 0.0, 1.0, 0.0, 0.0),
-                   (size, 0.0, 0.0, 1.0, 0.0), (size + 1, 0.0, 0.0, 0.0, 1.0)]
-        for column, y, slope, start, end in columns:
-            one = LowPassState(y)
-            one.slope = slope
-            one.advance(_ORDER, _TWO_PI * cutoff * dt, start, end)
-            found[at:at + 2, column] = one.y, one.slope
+        at, step = slice(2 * k, 2 * k + 2), transition(_ORDER, _TWO_PI * cutoff * dt)
+        found[at, at], found[at, size:] = step[:, :2], step[:, 2:]
     return found
 
 
