@@ -35,7 +35,7 @@ _LEVEL_SD, _CURRENT_SD = 0.2, 2.0
 _REACH = 4.0  # Bounds of the parameters, in prior deviations
 # Mean load before the first sample, relative to the mean load (chosen on roma and cf_pair; 0.3 to
 # 0.5 work).
-_BEFORE = 0.4
+BEFORE = 0.4
 # Bins over which the data are averaged before a fit: width, s (slow error and polarisation are
 # slower), maximum share of the recording, and maximum number.
 _BIN, _BIN_SHARE, _MOST = 0.05, 0.01, 20_000
@@ -111,7 +111,7 @@ class LoadFit:
         else:
             u = lowpass(u, t, LAG)
             x = u ** POWER
-            slowest = lowpass(x, t, LAGS[-1], _BEFORE * self.mean_load)
+            slowest = lowpass(x, t, LAGS[-1], BEFORE * self.mean_load)
             rows = [x, u, u ** 3, *(lowpass(x, t, tau) for tau in LAGS[:-1]), slowest,
                     *(lowpass(u, t, tau) for tau in LINEAR_LAGS),
                     np.maximum(u - lowpass(u, t, INRUSH_TIME), 0.0)]

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 from ou_monitor.model.load import LAGS, lowpass
+from ou_monitor.model.load_fit import BEFORE, Load, LoadFit
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import HOLD, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
@@ -401,3 +402,24 @@ def test_the_fall_of_an_emptying_pack_is_no_sag():
         v = level - full * lowpass(u, t, 0.06) ** 1.4 + 0.007 * cells * rng.standard_normal(t.size)
         errors.append(float(loaded(t, v, u).sag(0.7)) / (full * 0.7 ** 1.4) - 1.0)
     assert np.median(np.abs(errors)) < 0.3
+
+
+def test_the_fit_of_recordings_has_the_regressors_of_the_filter():
+    """One load model, computed sample by sample and for a whole recording."""
+    rng, t = np.random.default_rng(4), np.arange(0.0, 110.0, 0.02)
+    u = np.where(t < 30.0, np.repeat(rng.uniform(0.1, 0.9, t.size // 25), 25), 0.3)
+    loads = LoadFilter()
+    loads.push(t, TRUE.path(t, u) + 0.02 * rng.standard_normal(t.size), u)
+    state = loads.state()
+    # The last 80 s were at 0.3, so that all lags are settled; then steps of throttle.
+    ahead = t[-1] + np.arange(0.02, 1.5, 0.02)
+    stick = np.where(np.sin(20.0 * ahead) > 0.0, 0.8, 0.3)
+    fit = LoadFit(Load.THROTTLE, False, 4, 1.0, 0.3 ** 1.8 / BEFORE, np.append(
+        state.mean[0], state.size * state.mean[2:]), np.empty((0, 0)))
+    rows = fit.regressors(np.append(t[-1], ahead), np.append(0.3, stick))[:, 1:]
+    path = fit.voltage(fit.values, rows)
+    assert np.ptp(path) > 1.0
+    # The filter's level falls with the charge drawn.
+    fall = path - loads.path(ahead, stick)
+    np.testing.assert_allclose(fall, fall[-1] / rows[0, -1] * rows[0], atol=1e-3)
+    assert 0.0 < fall[-1] < 0.05
