@@ -82,7 +82,9 @@ class Row:
         """Return whether the recording, then each simulation, lies outside the band."""
         values = np.append(self.measured, self.simulated)
         hair = 1e-9 * np.abs(values)
-        return np.asarray((values < self.low - hair) | (values > self.high + hair))
+        # No distance from the distribution is too small.
+        low = 0.0 if self.kind == 'ks' else self.low
+        return np.asarray((values < low - hair) | (values > self.high + hair))
 
     @property
     def power_ratio(self) -> float:

@@ -306,7 +306,7 @@ def test_a_coarse_adc_may_have_any_offset(offset):
     v = rail.simulate(t, np.random.default_rng(3))
     found = compare(Recording(t, step * (np.rint(v / step - offset) + offset)), rail, seeds=20)
     ks, = found.of('ks')
-    assert found.verdict is Likeness.LOOKS_LIKE_IT and ks.measured < ks.high
+    assert found.verdict is Likeness.LOOKS_LIKE_IT and ks.inside
     assert all(one.low / 1.2 < one.measured < 1.2 * one.high for one in found.of('dips'))
 
 
