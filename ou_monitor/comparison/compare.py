@@ -452,7 +452,8 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     begin = _start_index(samples, fit_until, fitted=model is None)
     late: list[str] = []
     if samples.current is not None:
-        current, sign = on_time(samples.t, samples.voltage, samples.current, 'current', late)
+        current, sign = on_time(samples.t, samples.voltage, samples.current, 'current', late,
+                                begin if model is None else None)
         samples = replace(samples, current=current * (sign if model is None else 1.0))
     if model is None:
         fitted = fit_flight(samples.part(slice(0, begin)))

@@ -133,12 +133,13 @@ def _part(v: FloatArray) -> slice:
     return slice(None, None, -(-v.size // _EXAMINED))
 
 
-def on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str]
-            ) -> tuple[FloatArray, float]:
+def on_time(t: FloatArray, v: FloatArray, load: FloatArray, name: str, notes: list[str],
+            stop: int | None = None) -> tuple[FloatArray, float]:
     """Return a load with late stamps corrected, and its sign; note the correction."""
+    # stop: number of samples that may be used to find both; the rest is held out.
     # If the voltage seems to precede its load, the stamps of the load are late.  If the voltage
     # lags behind its load, the cause is `load_transient`.
-    some = _part(v)
+    some = slice(None, stop, _part(v[:stop]).step)
     late, sign = timing(t[some], v[some], load[some])
     if not late > 0.0 or (name == 'throttle' and sign < 0.0):
         return load, sign
