@@ -27,7 +27,8 @@ from ou_monitor.records import Defect, defect_of, FloatArray, Note, Recording
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import clock_of, ThrottleHold
 from ou_monitor.text import counted, outside_words, part_words, printable, some
-from ou_monitor.timeline import back_words, BATCH, check_throttle, plausible_stamps
+from ou_monitor.timeline import (
+    back_words, BATCH, check_throttle, held_words, plausible_stamps)
 
 
 def choose(
@@ -237,6 +238,7 @@ def read_bag(
                 notes.append(Note(f"{counted(unknown, 'throttle value')} dropped: not a finite "
                                   'number.', Defect.NON_FINITE))
             check_throttle(name, holds[which].held()[1])
+            notes += filter(None, [held_words(t, holds[which].held()[0])])
     volts, current = supply.values, None
     if np.isfinite(supply.beside).any():
         current = np.repeat(supply.beside, supply.counts)

@@ -9,6 +9,7 @@ from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32)
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.samples import SampleStream
+from ou_monitor.timeline import held_words
 import pytest
 
 START = 1_704_067_200_000_000_000
@@ -157,3 +158,18 @@ def test_node_and_bench_take_the_same_readings(tmp_path, monkeypatch, period, ki
             np.testing.assert_array_equal(node[0], bench.t)
         else:
             assert np.abs(node[0] - bench.t).max() < 1.5e-3
+
+
+def test_a_throttle_without_new_values_is_told(tmp_path):
+    """Blank cells and messages that stop: its last value is held, and a note says for how long."""
+    t = np.arange(0.0, 20.0, 0.02)
+    gone = (t > 5.0) & (t < 12.0)
+    path = tmp_path / 'flight.csv'
+    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
+        f'{at:.2f},{15.0 + 0.01 * (k % 7):.2f},{"" if out else 0.3}\n'
+        for k, (at, out) in enumerate(zip(t.tolist(), gone.tolist()))))
+    (note,) = [note for note in read_recording(path).notes if 'no new value' in note]
+    assert 'for 7 s in all, the longest time from 5 s' in note
+    # Changes alone, at most ten usual intervals apart, are no gap.
+    assert not held_words(t, t[::40]) and not held_words(t, np.array([1.0]))
+    assert 'for 15 s in all' in held_words(t, t[t < 5.0])

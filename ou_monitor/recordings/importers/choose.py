@@ -22,7 +22,7 @@ from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, IMU, Log, Series, SPEEDS, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note, prefixed, Recording
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline import check_throttle, plausible_stamps
+from ou_monitor.timeline import check_throttle, held_words, plausible_stamps
 
 # Name by which the user leaves a quantity out.
 NONE = 'none'
@@ -102,11 +102,12 @@ def columns_of(path: Path, log: Log, chosen: ChosenSeries) -> Recording:
             held[one.quantity] = np.append(np.nan, _single(one.values))[place]
             taken[one.quantity] = one.name
     unknown = np.full(volts.n, np.nan)
+    said = '' if chosen.throttle is None else held_words(t, chosen.throttle.t)
     name = printable(path.name)
     return Recording(
         plausible_stamps(name, t), _single(volts.values), held.get(THROTTLE, unknown), name,
         {'file': name, 'format': log.format, **taken, **log.facts},
-        (*log.notes, *chosen.notes), held.get(CURRENT, unknown))
+        (*log.notes, *chosen.notes, *filter(None, [said])), held.get(CURRENT, unknown))
 
 
 def _in_a_bag(t: FloatArray) -> FloatArray:

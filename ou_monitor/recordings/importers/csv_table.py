@@ -33,7 +33,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, Recording, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline import hold, plausible_stamps, spread, WILD
+from ou_monitor.timeline import held_words, hold, plausible_stamps, spread, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'
@@ -154,7 +154,9 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
             said.append(f"{counted(int((~filled).sum()), 'row')} left out: the cell of "
                         f"'{printable(column.name)}' is empty.")
     # A blank throttle cell means no new command: hold the last one.
-    throttle = hold(held.get(logs.THROTTLE, nothing))
+    throttle = held.get(logs.THROTTLE, nothing)
+    said += filter(None, [held_words(t, t[np.isfinite(throttle)])])
+    throttle = hold(throttle)
     if filled.any():
         t, volts, throttle, current = (one[filled] for one in (t, volts, throttle, current))
     if t.size >= _FEW_ROWS and 2 * np.unique(t).size < t.size:
