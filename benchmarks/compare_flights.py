@@ -10,18 +10,18 @@ import sys
 import time
 
 from common import arguments, deliver, flights, say, table
-from ou_monitor.comparison.compare import Agreement, compare, Row
+from ou_monitor.comparison.compare import Agreement, compare, ComparedNumber
 
 HEAD = ['flight', 's', 'explained', 'bias mV', 'lowest V', 'simulated', 'dips 1 %', 'simulated',
         'dips 5 %', 'simulated', 'verdict', 'CPU s']
 
 
-def beside(of: Row, digits: int) -> str:
+def beside(of: ComparedNumber, digits: int) -> str:
     """Return the median of the simulations and their 95 % band."""
     return f'{of.median:.{digits}f} [{of.low:.{digits}f}, {of.high:.{digits}f}]'
 
 
-def within(of: Row, factor: float = 2.0) -> bool:
+def within(of: ComparedNumber, factor: float = 2.0) -> bool:
     """Return whether the median is within a factor of the measured number."""
     return of.measured / factor <= of.median <= of.measured * factor
 

@@ -13,7 +13,7 @@ import time
 
 from common import arguments, deliver, flights, say, table
 import numpy as np
-from ou_monitor.model.load_fit import fit_load, Load
+from ou_monitor.model.load_fit import fit_load, LoadInput
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.records import Recording
 
@@ -38,7 +38,7 @@ def measure(name: str, recording: Recording) -> list[str]:
                else recording.current[good])
     second = t > 0.5 * t[-1]
     started = time.process_time()
-    fit = fit_load(Load.THROTTLE, t[~second], v[~second], u[~second], falls=True)
+    fit = fit_load(LoadInput.THROTTLE, t[~second], v[~second], u[~second], falls=True)
     fit_time = time.process_time() - started
     ahead = explained(v[second], fit.path(t, u)[second])
     loads = LoadFilter()

@@ -31,7 +31,7 @@ from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, on_time, usable, why_no_model
 from ou_monitor.errors import InputError
-from ou_monitor.model.load_fit import Load
+from ou_monitor.model.load_fit import LoadInput
 from ou_monitor.model.sinusoid import LOBE
 from ou_monitor.model.spectral_lines import find_lines, Line
 from ou_monitor.model.supply import SupplyModel
@@ -48,7 +48,7 @@ class Likeness(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ComparedNumber:
     """A number of the recording beside its distribution over the simulations."""
 
     kind: str  # Key of _WEIGHTS
@@ -162,7 +162,7 @@ class Agreement:
     rmse: float
     bias: float
     bias_by_third: tuple[float, ...]  # V
-    rows: tuple[Row, ...]
+    rows: tuple[ComparedNumber, ...]
     rises: int  # Rises of throttle
     p_value: float  # Share, of simulations and recording, with at least the recording's score
     verdict: Likeness
@@ -171,12 +171,12 @@ class Agreement:
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
 
-    def of(self, kind: str) -> list[Row]:
+    def of(self, kind: str) -> list[ComparedNumber]:
         """Return the rows of a kind."""
         return [row for row in self.rows if row.kind == kind]
 
     @property
-    def lowest(self) -> Row:
+    def lowest(self) -> ComparedNumber:
         """Return the lowest voltage."""
         return self.of('lowest')[0]
 
@@ -293,15 +293,16 @@ class Yardstick:
             np.array([v.min(), v.mean(), *dips, *falls, *np.sqrt(power), *line]), response,
             np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
-    def rows(self, own: Measures, others: Sequence[Measures], bias: Sequence[float]) -> list[Row]:
+    def rows(self, own: Measures, others: Sequence[Measures], bias: Sequence[float]
+             ) -> list[ComparedNumber]:
         """Return the rows of a table (bias: of the mean path by third, V)."""
         volts = max(_RANGE * self._spread, 1e-12)
-        rows: list[Row] = []
+        rows: list[ComparedNumber] = []
         numbers = zip(own.numbers.tolist(), np.array([one.numbers for one in others]).T)
 
         def add(kind: str, name: str, unit: str, digits: int, least: float, words: str,
                 *at: float) -> None:
-            rows.append(Row(kind, name, unit, digits, *next(numbers), least, words, at))
+            rows.append(ComparedNumber(kind, name, unit, digits, *next(numbers), least, words, at))
 
         add('lowest', 'lowest voltage', 'V', 4, volts,
             'the lowest voltage is {median} V ({low} to {high}), measured {measured} V')
@@ -331,7 +332,7 @@ class Yardstick:
                 f'the line at {hz} Hz has {{median}} mV rms, measured {{measured}} mV',
                 self._line.frequency)
         pooled = np.mean([one.distribution for one in (own, *others)], axis=0)
-        return [*rows, Row(
+        return [*rows, ComparedNumber(
             'ks', 'distribution (KS distance)', '', 2, distance(own, pooled),
             np.array([distance(one, pooled) for one in others]), _KS,
             'the share of time below a voltage differs by up to {measured} (simulations among '
@@ -404,7 +405,7 @@ _LOW, _HIGH = 2.5, 97.5
 RECOVERED = 1.0
 
 
-def judge(found: Sequence[Row], explained: float, moved: bool
+def judge(found: Sequence[ComparedNumber], explained: float, moved: bool
           ) -> tuple[float, Likeness, str, str]:
     """Return p-value, verdict, the largest difference in words, and its kind."""
     # explained: share of the variance explained by the mean path; moved: whether that path moves.
@@ -458,7 +459,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     if model is None:
         fitted = fit_flight(samples.part(slice(0, begin)))
         names, draw = fitted.names, fitted.simulator(samples)
-        notes += (late if fitted.fits[0].load is Load.CURRENT else []) + _fit_notes(
+        notes += (late if fitted.fits[0].load is LoadInput.CURRENT else []) + _fit_notes(
             fitted, samples)
         report(0.3)
     else:
@@ -587,9 +588,9 @@ def _start_index(samples: Readings, fit_until: float | None, fitted: bool) -> in
 
 def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
     fit = model.fits[0]
-    if fit.load is not Load.NONE:
+    if fit.load is not LoadInput.NONE:
         found = []
-        if fit.load is Load.CURRENT:
+        if fit.load is LoadInput.CURRENT:
             found.append('The simulated load is current, which explains the voltage better than '
                          'throttle.' if samples.throttle is not None else
                          'The simulated load is current.')

@@ -20,7 +20,7 @@ from ou_monitor.criticism.adc import find_step
 from ou_monitor.model.arma import theta_at
 from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.load import lowpass
-from ou_monitor.model.load_fit import fit_load, Load, LoadFit, SLOW_TIME
+from ou_monitor.model.load_fit import fit_load, LoadFit, LoadInput, SLOW_TIME
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.ou_fit import (
     fit_pieces, load_signs, NoiseSize, stretches, usual_walk, white_variance)
@@ -175,7 +175,7 @@ class FlightModel:
     def names(self) -> list[str]:
         """Return the names of its terms, as in a model file."""
         fit = self.fits[0]
-        return ['ou', *(['load_sag', 'load_transient'] if fit.load is not Load.NONE else []),
+        return ['ou', *(['load_sag', 'load_transient'] if fit.load is not LoadInput.NONE else []),
                 *(['drift'] if fit.falls else []), 'measurement_noise',
                 *(['load_dependent_noise'] if self.noise.sizes.follows else [])]
 
@@ -204,8 +204,8 @@ class FlightModel:
         return draw
 
 
-def _load(kind: Load, samples: Readings) -> FloatArray | None:
-    return samples.current if kind is Load.CURRENT else samples.throttle
+def _load(kind: LoadInput, samples: Readings) -> FloatArray | None:
+    return samples.current if kind is LoadInput.CURRENT else samples.throttle
 
 
 def _mean_path(fits: tuple[LoadFit, ...], odds: FloatArray, samples: Readings) -> FloatArray:
@@ -239,7 +239,7 @@ def fit_flight(samples: Readings) -> FlightModel:
     fits, odds = _best(samples)
     kind, n = fits[0].load, samples.t.size
     held_out = []
-    for j in range(_PARTS if kind is not Load.NONE else 0):
+    for j in range(_PARTS if kind is not LoadInput.NONE else 0):
         part = slice(j * n // _PARTS, (j + 1) * n // _PARTS)
         fit = _fit(samples, kind, fits[0].falls, part)
         path = fit.path(samples.t, _load(kind, samples))
@@ -251,7 +251,7 @@ def fit_flight(samples: Readings) -> FlightModel:
     return FlightModel(fits, odds, damped, _sag_error(held_out), noise, float(samples.t[-1]))
 
 
-def _fit(samples: Readings, load: Load, falls: bool, left_out: slice = slice(0)) -> LoadFit:
+def _fit(samples: Readings, load: LoadInput, falls: bool, left_out: slice = slice(0)) -> LoadFit:
     return fit_load(load, samples.t, samples.voltage, _load(load, samples), falls=falls,
                     left_out=left_out)
 
@@ -259,11 +259,11 @@ def _fit(samples: Readings, load: Load, falls: bool, left_out: slice = slice(0))
 def _best(samples: Readings) -> tuple[tuple[LoadFit, ...], FloatArray]:
     """Return the fits of the best load, with both kinds of level, and their probabilities."""
     # The simpler comes first: no load, throttle, current.
-    fits: tuple[LoadFit, ...] = (_fit(samples, Load.NONE, falls=False),)
+    fits: tuple[LoadFit, ...] = (_fit(samples, LoadInput.NONE, falls=False),)
     odds = np.ones(1)
     most = fits[0].evidence
-    for load, x, least in ((Load.THROTTLE, samples.throttle, MOVES),
-                           (Load.CURRENT, samples.current, 1e-300)):
+    for load, x, least in ((LoadInput.THROTTLE, samples.throttle, MOVES),
+                           (LoadInput.CURRENT, samples.current, 1e-300)):
         if x is None or not np.ptp(x) >= least:
             continue
         pair = sorted((_fit(samples, load, falls) for falls in (False, True)),

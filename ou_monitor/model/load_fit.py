@@ -56,7 +56,7 @@ _ROUNDS, _EVALUATIONS, _STEP = 4, 30, 1e-4
 _FORM = 1.25
 
 
-class Load(enum.Enum):
+class LoadInput(enum.Enum):
     """Input to which the voltage responds."""
 
     NONE = 'none'
@@ -68,7 +68,7 @@ class Load(enum.Enum):
 class LoadFit:
     """A fitted load model, and its errors."""
 
-    load: Load
+    load: LoadInput
     falls: bool  # Whether the level falls as the load discharges a pack
     cells: int  # Cells in series
     full: float  # Throttle, or current, A, at a load of 1
@@ -101,12 +101,12 @@ class LoadFit:
 
     def regressors(self, t: FloatArray, load: FloatArray | None) -> FloatArray:
         """Return the charge drawn, in s at the mean load, and the regressors of the response."""
-        if self.load is Load.NONE:
+        if self.load is LoadInput.NONE:
             return np.zeros((1, t.size))
         if load is None:
             raise ValueError(f'the load of this model is {self.load.value}, and none was given')
         u = load / self.full
-        if self.load is Load.CURRENT:
+        if self.load is LoadInput.CURRENT:
             x, rows = u, [u, *(lowpass(u, t, tau) for tau in LAGS)]
         else:
             u = lowpass(u, t, LAG)
@@ -125,7 +125,7 @@ class LoadFit:
         charge, endurance, warming = values[:3].tolist()
         cell = open_circuit(np.maximum(charge - rows[0] / math.exp(endurance), -1.0))
         size = np.exp(warming * (cell - CELL))
-        if self.load is Load.THROTTLE:
+        if self.load is LoadInput.THROTTLE:
             # A propeller draws less at a lower voltage: I ~ u (u V)^(p - 1).
             size *= (np.maximum(cell, 2.0) / CELL) ** (POWER - 1.0)
         return np.asarray(self.cells * cell - size * response)
@@ -168,23 +168,24 @@ class _Noise:
             self._set(white, float(self._tried[int(np.argmin(scores))]))
 
 
-def _prior(load: Load, falls: bool, volts: float, top: float, cells: int
+def _prior(load: LoadInput, falls: bool, volts: float, top: float, cells: int
            ) -> tuple[FloatArray, FloatArray]:
     """Return mean and root of covariance: level, ln of the size, shares of the coefficients."""
-    level = [_CHARGE, _BY_CURRENT if load is Load.CURRENT else _ENDURANCE,
+    level = [_CHARGE, _BY_CURRENT if load is LoadInput.CURRENT else _ENDURANCE,
              (WARMING, WARMING_SE)] if falls else [(top, _LEVEL_SD * cells)]
-    if load is Load.NONE:
+    if load is LoadInput.NONE:
         mean, deviation = np.array(level).T
         return mean, np.diag(deviation)
-    size_sd, shares, root = (
-        _CURRENT_SD, CURRENT_SHARES, np.diag(CURRENT_SHARE_STD)) if load is Load.CURRENT else (
-        SAG_SD, *usual_shares())
+    size_sd, shares, root = SAG_SD, *usual_shares()
+    if load is LoadInput.CURRENT:
+        size_sd, shares, root = _CURRENT_SD, CURRENT_SHARES, np.diag(CURRENT_SHARE_STD)
     mean, deviation = np.array([*level, (math.log(SAG * volts), size_sd)]).T
     return np.append(mean, shares), block_diag(np.diag(deviation), root)
 
 
-def fit_load(kind: Load, t: FloatArray, voltage: FloatArray, load: FloatArray | None = None, *,
-             falls: bool = False, left_out: slice = slice(0)) -> LoadFit:
+def fit_load(kind: LoadInput, t: FloatArray, voltage: FloatArray,
+             load: FloatArray | None = None, *, falls: bool = False, left_out: slice = slice(0)
+             ) -> LoadFit:
     """Fit the load model to finite samples, s, V, 0..1 or A (left_out: voltage not used)."""
     if t.size < _LEAST:
         raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')
@@ -204,10 +205,10 @@ def fit_load(kind: Load, t: FloatArray, voltage: FloatArray, load: FloatArray | 
     volts, top = np.quantile(voltage[seen], [0.99, 0.98]).tolist()
     cells = cells_in_series(volts)
     x, full = (np.ones(1) if load is None else load), 1.0
-    if kind is Load.CURRENT:
+    if kind is LoadInput.CURRENT:
         full = max(float(np.quantile(np.abs(x), 0.99)), 1e-9)
         x = x / full
-    elif kind is Load.THROTTLE:
+    elif kind is LoadInput.THROTTLE:
         x = x ** POWER
     centre, root = _prior(kind, falls, volts, top, cells)
     model = LoadFit(kind, falls, cells, full, max(1e-3, float(x.mean())), centre, root)

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.comparison.compare import (
-    Agreement, between_codes, compare, judge, Likeness, Row, Yardstick)
+    Agreement, between_codes, compare, judge, Likeness, ComparedNumber, Yardstick)
 from ou_monitor.comparison.flight_model import (
     _sag_error, damping, fit_flight, fit_noise, FlightNoise, Readings)
 from ou_monitor.errors import InputError
@@ -457,9 +457,9 @@ def test_the_mean_response_to_rises_is_measured():
     assert not Yardstick(Readings(t, v, None), 0.0).measure(v).response.size
 
 
-def row(kind: str, measured: float, simulated: np.ndarray, least: float = 1e-9) -> Row:
+def row(kind: str, measured: float, simulated: np.ndarray, least: float = 1e-9) -> ComparedNumber:
     """Return a row whose wording is its kind."""
-    return Row(kind, kind, 'V', 3, measured, simulated, least, kind)
+    return ComparedNumber(kind, kind, 'V', 3, measured, simulated, least, kind)
 
 
 def test_the_worst_is_the_farthest_in_half_bands():

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.model.load import cells_in_series, charge_at, lowpass, open_circuit
-from ou_monitor.model.load_fit import fit_load, Load
+from ou_monitor.model.load_fit import fit_load, LoadInput
 from project import needs_recordings, REAL, recorded, ROOT
 import pytest
 from simulated_packs import Pack
@@ -45,10 +45,10 @@ def test_a_simulated_pack_is_predicted():
     u = steps(5)
     clean = Pack(4, 0.25, charge=0.85, size=0.15, power=1.9, endurance=400.0).path(T, u)
     v = clean + 0.05 * np.random.default_rng(6).standard_normal(T.size)
-    falls, constant = (fit_load(Load.THROTTLE, T[HALF], v[HALF], u[HALF], falls=falls)
+    falls, constant = (fit_load(LoadInput.THROTTLE, T[HALF], v[HALF], u[HALF], falls=falls)
                        for falls in (True, False))
     assert falls.evidence > constant.evidence + 3.0
-    assert falls.evidence > fit_load(Load.NONE, T[HALF], v[HALF]).evidence + 100.0
+    assert falls.evidence > fit_load(LoadInput.NONE, T[HALF], v[HALF]).evidence + 100.0
     assert np.sqrt(np.mean((falls.path(T, u) - clean)[~HALF] ** 2)) < 0.05
 
 
@@ -56,12 +56,12 @@ def test_a_simulated_pack_is_predicted():
 def test_the_errors_of_a_fit_are_those_of_its_predictions(falls):
     """A response of the fitted form: of 20 fits the mean error is some standard errors squared."""
     u = steps(7)
-    true = fit_load(Load.THROTTLE, T, Pack(4, 0.25).path(T, u), u, falls=falls)
+    true = fit_load(LoadInput.THROTTLE, T, Pack(4, 0.25).path(T, u), u, falls=falls)
     clean, off = true.path(T, u), []
     for seed in range(20):
         rng = np.random.default_rng(seed)
         v = clean + 0.05 * rng.standard_normal(T.size)
-        fit = fit_load(Load.THROTTLE, T[HALF], v[HALF], u[HALF], falls=falls)
+        fit = fit_load(LoadInput.THROTTLE, T[HALF], v[HALF], u[HALF], falls=falls)
         drawn = [fit.draw(rng).path(T, u)[~HALF].mean() for _ in range(40)]
         off.append((clean[~HALF].mean() - np.mean(drawn)) / np.std(drawn))
     # chi^2 of 20; the slow error and the form, which are not simulated, make the errors larger.
@@ -74,7 +74,7 @@ def test_a_current_gives_ohms_law():
     current = 60.0 * steps(9)
     v = 12.0 - 0.02 * current + 0.01 * rng.standard_normal(T.size)
     spoiled = np.where(HALF, v, 3.0)
-    fit = fit_load(Load.CURRENT, T, spoiled, current, left_out=slice(2000, 4000))
+    fit = fit_load(LoadInput.CURRENT, T, spoiled, current, left_out=slice(2000, 4000))
     # Coefficients at once and after lags of less than a second.
     assert fit.values[1:4].sum() / fit.full == pytest.approx(0.02, rel=0.05)
     assert fit.path(T, current)[-500:] == pytest.approx(12.0 - 0.02 * current[-500:], abs=0.03)
@@ -87,7 +87,7 @@ def test_a_current_gives_ohms_law():
 @pytest.mark.parametrize('t', [np.array([0.0, 1.0, 1.0]), np.array([0.0, 0.1, 0.2])])
 def test_a_load_that_cannot_be_fitted_is_refused(t):
     with pytest.raises(ValueError, match='s'):
-        fit_load(Load.THROTTLE, t, np.full(3, 16.0), np.full(3, 0.3))
+        fit_load(LoadInput.THROTTLE, t, np.full(3, 16.0), np.full(3, 0.3))
 
 
 @pytest.mark.parametrize('path', [ROOT / 'bags/recorded/gecko.csv', *(
@@ -103,7 +103,7 @@ def test_a_fit_stays_physical(path):
     t, v, u = flight.t - flight.t[0], flight.voltage, np.clip(flight.throttle, 0.0, 1.0)
     t, v, u = t[::3], v[::3], u[::3]
     half = t <= 0.5 * t[-1]
-    fit = fit_load(Load.THROTTLE, t[half], v[half], u[half], falls=True)
+    fit = fit_load(LoadInput.THROTTLE, t[half], v[half], u[half], falls=True)
     swing = float(np.ptp(v))
     # No part of the response is much larger than what was flown, so none can cancel another.
     assert np.abs(fit.values[3:] * np.ptp(fit.regressors(t, u)[1:], axis=1)).max() < 1.5 * swing

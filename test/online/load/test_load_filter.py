@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 from ou_monitor.model.load import LAGS, lowpass
-from ou_monitor.model.load_fit import BEFORE, Load, LoadFit
+from ou_monitor.model.load_fit import BEFORE, LoadFit, LoadInput
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import HOLD, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
@@ -414,7 +414,7 @@ def test_the_fit_of_recordings_has_the_regressors_of_the_filter():
     # The last 80 s were at 0.3, so that all lags are settled; then steps of throttle.
     ahead = t[-1] + np.arange(0.02, 1.5, 0.02)
     stick = np.where(np.sin(20.0 * ahead) > 0.0, 0.8, 0.3)
-    fit = LoadFit(Load.THROTTLE, False, 4, 1.0, 0.3 ** 1.8 / BEFORE, np.append(
+    fit = LoadFit(LoadInput.THROTTLE, False, 4, 1.0, 0.3 ** 1.8 / BEFORE, np.append(
         state.mean[0], state.size * state.mean[2:]), np.empty((0, 0)))
     rows = fit.regressors(np.append(t[-1], ahead), np.append(0.3, stick))[:, 1:]
     path = fit.voltage(fit.values, rows)
