@@ -272,9 +272,10 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     """Return notes: withdrawn causes, and undecided questions."""
     notes = [named.failure] if named.failure else []
     for name in dict.fromkeys(dropped):
-        notes.append(f"'{name}' was fitted, but did not explain its statistics: withdrawn."
+        one = f"A further '{name}'" if model.has(name) else f"'{name}'"
+        notes.append(f'{one} was fitted, but did not explain its statistics: withdrawn.'
                      if name in named.dropped else
-                     f"'{name}' was fitted, but did not improve predictions of held-out samples, "
+                     f'{one} was fitted, but did not improve predictions of held-out samples, '
                      'or its size is not determined: left out.')
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))

@@ -130,8 +130,10 @@ def is_vague(value: Any, error: Any) -> bool:
 def explain(term: Term, se: Mapping[str, Any], alternatives: Sequence[str], exact: bool = False,
             why: str = '', together: int = 1) -> str:
     """Return an explanation of a cause: meaning, estimate, why its gain is unknown, remedy."""
-    # If several terms share a row, use the texts of their class, not of one term.
-    about = type(term) if together > 1 else term
+    # If several terms share a row, or no amplitude differs from 0, use the texts of the class.
+    unsigned = bool(term.LINEAR) and all(
+        abs(getattr(term, name)) < Z95 * (se.get(name) or 0.0) for name in term.LINEAR)
+    about = type(term) if together > 1 or unsigned else term
     parts = [about.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('The samples themselves show it, without a model.')
@@ -179,7 +181,7 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), uncovered: int = 0,
                   doubts: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the verdict as sentences: causes, gain, whether simulations pass, refusal."""
+    """Return the verdict as sentences: causes, whether simulations pass, gain, refusal."""
     # why: reason for an unknown gain; uncovered: samples at a throttle that other blocks lack.
     if not found.causes:
         return (by_load(_without_causes(found, dropped, uncovered), found.load),)
@@ -194,8 +196,9 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
     refused = [f'{found.refused}: trust the named causes, not the fitted values.'
                ] if found.refused else []
     return tuple(by_load(text, found.load) for text in (
-        f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.', _gain(found, why),
-        f'{": ".join([closer, *(["; ".join(doubts)] if doubts else [])])}.', *refused))
+        f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
+        f'{": ".join([closer, *(["; ".join(doubts)] if doubts else [])])}.',
+        _gain(found, why), *refused))
 
 
 def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> str:

@@ -150,7 +150,8 @@ def _fall_within_budget(analysis: Analysis) -> str:
         top = float(np.fmax.reduce(recording.throttle[first:last + 1], initial=0.0))
         if top <= analysis.by_throttle.budget + 0.01:
             return (f'; but at {number(dip.begin_s, 4)} s the voltage was below '
-                    f'{dips.limit_v:g} V at {100.0 * top:.0f} % throttle')
+                    f'{dips.limit_v:g} V, with at most {100.0 * top:.0f} % throttle in the second '
+                    'before')
     return ''
 
 

@@ -327,6 +327,20 @@ def test_a_sag_smaller_than_its_error_is_a_bound():
         assert determined(one, 4)
 
 
+def test_no_sag_is_given_where_none_can_be():
+    """None at 0 % throttle alone, and none beyond half of the voltage by extrapolation."""
+    found = overview(paced(seconds=20.0))
+    sag = replace(found.facts.sag, sag_v=(0.0,) * 11, se_v=(0.0,) * 11, known=False)
+    idle = replace(found, flown=(0, 0), facts=replace(found.facts, sag=sag))
+    assert len(answers(idle)) == 1
+    assert dict(known_lines(idle))['Sag'].startswith('unknown')
+    half = 0.5 * found.load.level
+    for most, words in ((0.99 * half, 'V (+- 20.0 mV) extrapolated'), (1.01 * half, 'cannot be')):
+        sag = replace(found.facts.sag, sag_v=(0.5,) * 10 + (most,), se_v=(0.01,) * 11, known=True)
+        steep = replace(found, facts=replace(found.facts, sag=sag))
+        assert words in dict(known_lines(steep))['Sag']
+
+
 @pytest.mark.parametrize('last', [0.030, 0.015])
 def test_one_loud_throttle_is_no_trend(last):
     """Of 16 mV at all throttles; as an end alone, 30 mV would be growth."""

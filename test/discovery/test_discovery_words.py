@@ -29,7 +29,7 @@ def left_over(name):
     (NAN, 0.01, 'cannot be measured on this recording.'), (0.1, NAN, 'No measurable gain on')])
 def test_a_gain_counts_beyond_1_96_standard_errors(gain, error, words):
     found = replace(finding(Verdict.EXPLAINED, [SAG]), gain=gain, gain_se=error)
-    assert words in verdict_words(found)[1]
+    assert words in verdict_words(found)[2]
 
 
 @pytest.mark.parametrize('value, error, text', [
@@ -111,6 +111,19 @@ def test_the_answer_begins_with_the_largest_gains():
     assert more.closer and not replace(more, larger=True).closer
 
 
+def test_the_verdict_comes_before_the_gain():
+    """The last lines on a terminal repeat the first two sentences."""
+    _, verdict, gain = verdict_words(finding(Verdict.EXPLAINED, [SAG]))
+    assert 'passes every test' in verdict and 'mnat' in gain
+
+
+@pytest.mark.parametrize('error, inrush', [(0.2, True), (1.1, False)])
+def test_an_answer_whose_sign_is_not_known_is_not_said_to_be_inrush(error, inrush):
+    term = LoadTransient(2.0, 0.009, 0.0, -3.6)
+    text = explain(term, {'gain': error, 'rise': 2.0 * error}, [])
+    assert ('inrush of motors' in text.replace('lag, inrush', '')) == inrush
+
+
 def test_every_cause_has_a_plain_name():
     assert set(PLAIN_NAMES) == set(catalogue()) - {'ou'}
     assert len(set(PLAIN_NAMES.values())) == len(PLAIN_NAMES)
@@ -172,7 +185,7 @@ def test_a_gain_has_its_error_or_says_that_it_is_unknown(gain, error, text):
 def test_the_size_of_errors_is_told_only_where_it_gains():
     """Single large errors may outweigh in the rms what the density gains; JSON has both parts."""
     for shrink, parts in ((0.0, True), (0.0198, False), (0.1, False)):
-        words = verdict_words(finding(Verdict.EXPLAINED, [SAG], shrink=shrink))[1]
+        words = verdict_words(finding(Verdict.EXPLAINED, [SAG], shrink=shrink))[2]
         assert ('size is predicted' in words) is parts and '20.0 +- 5.9 mnat' in words
 
 

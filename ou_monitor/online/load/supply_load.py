@@ -68,7 +68,7 @@ class LoadStatus(enum.Enum):
     NO_DATA = 'No voltage has arrived.'
     NO_THROTTLE = ('Throttle is unknown, so the sag is unknown too; the level is the voltage '
                    'under load.')
-    STILL = 'Throttle has not moved: the sag is unknown.'
+    STILL = 'Throttle has moved by less than 2 %: too little for a sag over throttle.'
     UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
     NO_RELATION = ('The voltage does not fall with throttle, as on a regulated rail; on a '
                    'battery, check topic, unit and sign of throttle.')
