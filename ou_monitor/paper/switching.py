@@ -19,6 +19,7 @@ from ou_monitor.paper.theory import (
     switching_intensity)
 from ou_monitor.records import FloatArray
 from scipy.integrate import quad
+from scipy.linalg import expm
 
 WHERE = 'Section 3.3'
 # Telegraph noise of +-SPEED, V/s, with RATE switches a second each way.
@@ -94,7 +95,7 @@ def rows(rng: np.random.Generator, paths: int = 20_000) -> list[Row]:
 
 def _potential() -> Row:
     chain = telegraph().generator
-    found, _ = quad(lambda t: float(chain.transition(t)[0, 0] - chain.stationary[0]),
+    found, _ = quad(lambda t: float(expm(chain.q * t)[0, 0] - chain.stationary[0]),
                     0.0, 40.0 / RATE, epsrel=1e-10)
     return Row(WHERE, 'R0(0, 0) of a telegraph', 'ms', Printed(f'{1e3 * found:.6g}'),
                1e3 * float(chain.potential[0, 0]),

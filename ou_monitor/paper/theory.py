@@ -26,7 +26,6 @@ its diffusion limit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
@@ -43,32 +42,21 @@ def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray)
     """Move m states along their affine systems (1/s), each for its own time tau, s."""
     # Taylor series of the exponential acting on the state, to double precision, in substeps of
     # norm at most 1. It needs no eigenvectors, so it handles a defective matrix too.
-    if not u.size:
-        return u.copy()
-    step = tau[:, None]
     norm = np.abs(matrix).sum(axis=-1).max(axis=-1)
-    reach = float(np.max(np.abs(tau) * norm))
+    reach = float(np.max(np.abs(tau) * norm, initial=0.0))
     parts = max(1, math.ceil(reach))
-    step = step / parts
+    step = tau[:, None] / parts
     reach /= parts
     for _ in range(parts):
-        term = step * (_times(matrix, u) + offset)
+        term = step * (np.einsum('mij,mj->mi', matrix, u) + offset)
         u = u + term
         k, size = 1, reach
         while size > 1e-17:
             k += 1
-            term = (step / k) * _times(matrix, term)
+            term = (step / k) * np.einsum('mij,mj->mi', matrix, term)
             u += term
             size *= reach / k
     return u
-
-
-def _times(matrix: FloatArray, u: FloatArray) -> FloatArray:
-    if matrix.ndim == 2:
-        return u @ matrix.T
-    if u.shape[1] == 1:
-        return matrix[:, :, 0] * u
-    return np.asarray(np.einsum('mij,mj->mi', matrix, u))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,10 +154,8 @@ def matrix_model(alpha: float, omega: float, beta: float, alpha_p: float, *,
         np.array([0.0, carrier, 0.0]))
 
 
-IntArray = npt.NDArray[np.intp]
-
 # Tolerance of a row sum, as a share of the largest rate: rounding of the input.
-ROW_TOLERANCE = 1e-9
+_ROW_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,10 +171,32 @@ class Generator:
         if np.iscomplexobj(self.q):
             raise ValueError('rates must be real, 1/s')
         q = np.array(self.q, dtype=np.float64)
-        check_rates(q)
-        np.fill_diagonal(q, 0.0)
-        check_classes(q)
-        np.fill_diagonal(q, -q.sum(axis=1))
+        if q.ndim != 2 or q.shape[0] != q.shape[1]:
+            raise ValueError(f'Q must be square, got shape {q.shape}')
+        if len(q) < 2:
+            raise ValueError('Q must have two states or more: one state never switches')
+        if not np.isfinite(q).all():
+            row, column = np.argwhere(~np.isfinite(q))[0]
+            raise ValueError(f'Q[{row}, {column}] is {q[row, column]}: rates must be finite, 1/s')
+        rates = q - np.diag(np.diag(q))
+        if (rates < 0.0).any():
+            row, column = np.unravel_index(np.argmin(rates), q.shape)
+            raise ValueError(f'Q[{row}, {column}] = {q[row, column]:g} 1/s is negative: only the '
+                             'diagonal may be')
+        tolerance = _ROW_TOLERANCE * float(np.abs(q).max())
+        defect = q.sum(axis=1)
+        row = np.argmax(np.abs(defect))
+        if abs(defect[row]) > tolerance:
+            raise ValueError(
+                f'row {row} of Q sums to {defect[row]:.6g} 1/s, not to 0 (tolerance '
+                f'{tolerance:.3g} 1/s): its diagonal entry should be {-rates[row].sum():.6g}')
+        count, label = connected_components(rates > 0.0, directed=True, connection='strong')
+        if count > 1:
+            classes = [np.flatnonzero(label == c).tolist() for c in range(count)]
+            raise ValueError(
+                f'the chain has no single stationary law: not every state is reached from every '
+                f'other (states that reach one another: {", ".join(map(str, classes))})')
+        np.fill_diagonal(q, -rates.sum(axis=1))
         q.setflags(write=False)
         object.__setattr__(self, 'q', q)
 
@@ -227,84 +235,6 @@ class Generator:
         potential = np.asarray((np.linalg.inv(projector - self.q / rate) - projector) / rate)
         potential.setflags(write=False)
         return potential
-
-    @cached_property
-    def jump_probabilities(self) -> FloatArray:
-        """Return the kernel P of the embedded chain, shape (n, n), with a zero diagonal."""
-        p = self.q / self.leaving[:, None]
-        np.fill_diagonal(p, 0.0)
-        return np.asarray(p)
-
-    def transition(self, t: float) -> FloatArray:
-        """Return exp(Q t), shape (n, n): the law at time t, s, one row per initial state."""
-        if not 0.0 <= t < np.inf:
-            raise ValueError(f't must be zero or positive and finite, got {t} s')
-        return np.asarray(expm(self.q * t))
-
-    def starts(self, paths: int, rng: np.random.Generator) -> IntArray:
-        """Draw initial states from the stationary law."""
-        if paths < 1:
-            raise ValueError(f'paths must be 1 or more, got {paths}')
-        return np.asarray(rng.choice(self.size, paths, p=self.stationary), dtype=np.intp)
-
-    def segments(
-        self, edges: FloatArray, state: IntArray, rng: np.random.Generator,
-    ) -> Iterator[tuple[int, IntArray | slice, IntArray, FloatArray]]:
-        """Advance an ensemble of paths from jump to jump, stopping at every edge, s."""
-        # Yields, at each jump and edge: index of the interval, the paths that jump (at an edge:
-        # all), their states until then, and the time spent in these since the last yield, s.
-        rates, everyone = self.leaving, slice(None)
-        kernel = np.cumsum(self.jump_probabilities, axis=1)
-        # Each row ends at exactly 1.
-        kernel /= kernel[:, -1:]
-        hold = rng.standard_exponential(state.size) / rates[state]
-        for k, width in enumerate(np.diff(edges)):
-            left = np.full(state.size, width)
-            which = np.flatnonzero(hold < left)
-            while which.size:
-                held, at = hold[which], state[which]
-                yield k, which, at, held
-                rest = left[which] - held
-                at = (rng.random(at.size)[:, None] >= kernel[at]).sum(axis=1)
-                new = rng.standard_exponential(which.size) / rates[at]
-                left[which], state[which], hold[which] = rest, at, new
-                which = which[new < rest]
-            yield k, everyone, state.copy(), left
-            hold -= left
-
-
-def check_rates(q: FloatArray) -> None:
-    """Refuse a matrix that is not a generator (q in 1/s)."""
-    if q.ndim != 2 or q.shape[0] != q.shape[1]:
-        raise ValueError(f'Q must be square, got shape {q.shape}')
-    if len(q) < 2:
-        raise ValueError('Q must have two states or more: one state never switches')
-    if not np.isfinite(q).all():
-        row, column = np.argwhere(~np.isfinite(q))[0]
-        raise ValueError(f'Q[{row}, {column}] is {q[row, column]}: rates must be finite, 1/s')
-    off = q - np.diag(np.diag(q))
-    if (off < 0.0).any():
-        row, column = np.unravel_index(np.argmin(off), q.shape)
-        raise ValueError(
-            f'Q[{row}, {column}] = {q[row, column]:g} 1/s is negative: only the diagonal may be')
-    largest = float(np.abs(q).max())
-    defect = q.sum(axis=1)
-    row = int(np.argmax(np.abs(defect)))
-    if abs(defect[row]) > ROW_TOLERANCE * largest:
-        raise ValueError(
-            f'row {row} of Q sums to {defect[row]:.6g} 1/s, not to 0 (tolerance '
-            f'{ROW_TOLERANCE * largest:.3g} 1/s): its diagonal entry should be '
-            f'{-off[row].sum():.6g}')
-
-
-def check_classes(rates: FloatArray) -> None:
-    """Refuse chains in which some state cannot be reached from another (rates in 1/s)."""
-    count, label = connected_components(rates > 0.0, directed=True, connection='strong')
-    if count > 1:
-        classes = [np.flatnonzero(label == c).tolist() for c in range(count)]
-        raise ValueError(
-            f'the chain has no single stationary law: not every state is reached from every other '
-            f'(states that reach one another: {", ".join(map(str, classes))})')
 
 
 Scaling = Literal['averaging', 'diffusion']
@@ -351,16 +281,13 @@ class SwitchedSystem:
         beta: npt.ArrayLike, alpha_p: npt.ArrayLike,
     ) -> SwitchedSystem:
         """Return the matrix model of 3.1 with switched coefficients."""
-        columns = []
-        for name, value in (
-                ('alpha', alpha), ('omega', omega), ('beta', beta), ('alpha_p', alpha_p)):
-            array = np.asarray(value, dtype=np.float64)
-            if array.shape not in ((), (generator.size,)):
-                raise ValueError(
-                    f'{name} must be one number or have shape ({generator.size},), got '
-                    f'{array.shape}')
-            columns.append(np.broadcast_to(array, (generator.size,)).tolist())
-        systems = [matrix_model(*row) for row in zip(*columns, strict=True)]
+        given = {'alpha': alpha, 'omega': omega, 'beta': beta, 'alpha_p': alpha_p}
+        for name, value in given.items():
+            if np.shape(value) not in ((), (generator.size,)):
+                raise ValueError(f'{name} must be one number or have shape ({generator.size},), '
+                                 f'got {np.shape(value)}')
+        rows = np.column_stack([np.broadcast_to(one, generator.size) for one in given.values()])
+        systems = [matrix_model(*row) for row in rows.astype(np.float64).tolist()]
         return cls(generator, np.array([one.matrix for one in systems]),
                    np.array([one.offset for one in systems]))
 
@@ -391,18 +318,35 @@ class SwitchedSystem:
     ) -> FloatArray:
         """Draw paths with exact jump times, and exact motion between jumps (t in s)."""
         at_eps, times = self.scaled(eps, scaling), check_times(t)
-        state = at_eps.generator.starts(paths, rng)
+        if paths < 1:
+            raise ValueError(f'paths must be 1 or more, got {paths}')
+        chain, matrices, offsets = at_eps.generator, at_eps.matrices, at_eps.offsets
+        rates = chain.leaving
+        # Where each state jumps to, cumulated; each row ends at exactly 1.
+        kernel = np.cumsum(np.maximum(chain.q, 0.0), axis=1)
+        kernel /= kernel[:, -1:]
+        state = rng.choice(chain.size, paths, p=chain.stationary)
+        hold = rng.standard_exponential(paths) / rates[state]
         u = np.tile(check_state(u0, self.matrices.shape[1]), (paths, 1))
         found = np.empty((paths, times.size, u.shape[1]))
         found[:, 0] = u
         with np.errstate(over='ignore', invalid='ignore'):
-            for k, which, at, dt in at_eps.generator.segments(times, state, rng):
-                u[which] = flow(at_eps.matrices[at], at_eps.offsets[at], dt, u[which])
-                if isinstance(which, slice):
-                    if not np.isfinite(u).all():
-                        raise ValueError(
-                            f'unstable: a path overflows before t = {times[k + 1]:g} s')
-                    found[:, k + 1] = u
+            for k, width in enumerate(np.diff(times)):
+                left = np.full(paths, width)
+                which = np.flatnonzero(hold < left)
+                while which.size:
+                    held, at = hold[which], state[which]
+                    u[which] = flow(matrices[at], offsets[at], held, u[which])
+                    rest = left[which] - held
+                    at = (rng.random(at.size)[:, None] >= kernel[at]).sum(axis=1)
+                    new = rng.standard_exponential(which.size) / rates[at]
+                    left[which], state[which], hold[which] = rest, at, new
+                    which = which[new < rest]
+                u = flow(matrices[state], offsets[state], left, u)
+                if not np.isfinite(u).all():
+                    raise ValueError(f'unstable: a path overflows before t = {times[k + 1]:g} s')
+                found[:, k + 1] = u
+                hold -= left
         return found
 
 
