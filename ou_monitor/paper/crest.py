@@ -15,11 +15,12 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate, transition
+from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.shocks import Jumps
 from ou_monitor.paper import published
-from ou_monitor.paper.published import over, Printed, Range, Row
+from ou_monitor.paper.published import mean_and_error, over, Printed, Range, Row
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
@@ -54,11 +55,6 @@ class Crests:
         """5 % quantile of the shortest to 95 % quantile of the longest screens."""
         return (self.quantile(min(self.by_screen), TAIL),
                 self.quantile(max(self.by_screen), 1.0 - TAIL))
-
-
-def mean_and_error(values: FloatArray) -> tuple[float, float]:
-    """Return the mean of independent values and its standard error."""
-    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size))
 
 
 def crest_of(screens: FloatArray) -> FloatArray:
@@ -107,12 +103,8 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
 
 def screen_for(crest_factor: float) -> float:
     """Return the screen length at which an OU shows a crest factor, s."""
-    # At this length, half of the screens exceed crest/2 standard deviations on one side:
-    # passages above a high level d are nearly a Poisson process of rate alpha d exp(-d^2/2) /
-    # sqrt(2 pi).
-    d = 0.5 * crest_factor
-    rate = published.ALPHA.value * d * math.exp(-0.5 * d * d) / math.sqrt(2.0 * math.pi)
-    return math.log(2.0) / rate
+    # At this length, half of the screens exceed crest/2 standard deviations on one side.
+    return math.log(2.0) * mean_first_passage(0.0, 0.5 * crest_factor) / published.ALPHA.value
 
 
 def rows(crests: Crests) -> list[Row]:
@@ -156,18 +148,10 @@ class JumpCrest:
     mean: float
     error: float
     band: Range  # 5 % and 95 % of the screens
-    kurtosis: float  # Excess kurtosis of the stationary distribution
 
     def size(self, vrms: float) -> float:
         """Return the standard deviation of the jumps, in the unit of `vrms`."""
         return vrms * math.sqrt(2.0 * published.ALPHA.value * self.share / self.rate)
-
-
-def excess_kurtosis(rate: float, share: float) -> float:
-    """Return the excess kurtosis of an OU with normal jumps of mean zero."""
-    # The fourth cumulant of the jumps is rate E J^4 / (4 alpha), and E J^4 is 3 (E J^2)^2, with
-    # E J^2 = 2 alpha share Var_inf / rate.
-    return 3.0 * published.ALPHA.value * share * share / rate
 
 
 def simulate_jumps(rng: np.random.Generator, seconds: float,
@@ -191,8 +175,7 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
                 low, high = np.quantile(values, [TAIL, 1.0 - TAIL])
                 # Screens are many tau long, so neighbours are almost independent.
                 found.append(JumpCrest(
-                    ms, rate, share, *mean_and_error(values), (float(low), float(high)),
-                    excess_kurtosis(rate, share)))
+                    ms, rate, share, *mean_and_error(values), (float(low), float(high))))
         progress((k + 1) / len(RATES))
     return found
 
@@ -227,8 +210,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
                 f'{len(RATES) * len(SHARES)} rates and shares, Monte Carlo',
                 f'Largest mean: {best.mean:.1f} ({best.band[0]:.1f} to {best.band[1]:.1f}), '
                 f'with {best.rate:g} jumps a second of {best.size(state.vrms.value):.0f} mV rms, '
-                f'{100 * best.share:.0f} % of the variance, excess kurtosis '
-                f'{best.kurtosis:.1f}; impulses too short to count in Vrms would have to add '
-                f"{impulse_height(state, crests):.0f} mV to the OU's Vpp.",
+                f'{100 * best.share:.0f} % of the variance; impulses too short to count in Vrms '
+                f"would have to add {impulse_height(state, crests):.0f} mV to the OU's Vpp.",
                 error=best.error, band=best.band, printed_inputs=inputs, point=8))
     return result

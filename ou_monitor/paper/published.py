@@ -12,6 +12,8 @@ from decimal import Decimal
 import enum
 import math
 
+from ou_monitor.records import FloatArray
+
 Range = tuple[float, float]
 
 # Tolerance of a recomputed number, standard errors: by chance, one row in 370 exceeds it.
@@ -118,6 +120,11 @@ def _join(a: Range, b: Range | None) -> Range:
 def over(top: Range, below: Range) -> Range:
     """Return the range of a quotient of two positive ranges."""
     return top[0] / below[1], top[1] / below[0]
+
+
+def mean_and_error(values: FloatArray) -> tuple[float, float]:
+    """Return the mean of independent values and its standard error."""
+    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size))
 
 
 @dataclass(frozen=True)

@@ -76,14 +76,17 @@ def decay(time: FloatArray, start: float, alpha: float, offset: float = 0.0) -> 
     return np.asarray(start * np.exp(-alpha * time) + offset)
 
 
+# The paper's own fit: ln|U| over 0..35 ms.
+PAPER_FIT = fit_log_line(TIME[USED], VALUE[USED])
+
+
 @dataclass(frozen=True, eq=False)
 class DecayFit:
-    """start exp(-alpha t) + offset by least squares of the voltages."""
+    """start exp(-alpha t) + offset by least squares of the five voltages."""
 
     parameters: FloatArray  # start, alpha, 1/s, and the offset if there is one; shape (2,) or (3,)
     errors: FloatArray  # Standard errors; shape (2,) or (3,)
     rss: float  # Residual sum of squares
-    quantile: float  # Student's t of the 95 % interval for its degrees of freedom
 
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the curve at times, s."""
@@ -91,30 +94,23 @@ class DecayFit:
 
     def band(self, k: int) -> Range:
         """Return the 95 % interval of a parameter."""
-        reach = self.quantile * float(self.errors[k])
+        free = TIME.size - self.parameters.size
+        reach = float(stats.t.ppf(0.975, free)) * float(self.errors[k])
         return float(self.parameters[k]) - reach, float(self.parameters[k]) + reach
-
-
-def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> DecayFit:
-    """Fit an exponential, with or without a constant offset, to the voltages."""
-    line = fit_log_line(time, value)
-    first = [line.start, line.alpha, 0.0][:3 if offset else 2]
-    scale = [line.start, line.alpha, 0.1 * line.start][:len(first)]
-    found, covariance = curve_fit(decay, time, value, first, method='trf', x_scale=scale,
-                                  xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    rss = float(np.sum((decay(time, *found) - value) ** 2))
-    return DecayFit(found, np.sqrt(np.diag(covariance)), rss,
-                    float(stats.t.ppf(0.975, time.size - len(first))))
-
-
-# The paper's own fit: ln|U| over 0..35 ms.
-PAPER_FIT = fit_log_line(TIME[USED], VALUE[USED])
 
 
 @cache
 def decay_fits() -> tuple[DecayFit, DecayFit]:
-    """Return the fits of all five voltages, without and with an offset."""
-    return fit_curve(TIME, VALUE, offset=False), fit_curve(TIME, VALUE, offset=True)
+    """Return the fits without and with an offset."""
+    line, fits = fit_log_line(TIME, VALUE), []
+    start, alpha = line.start, line.alpha
+    for k, first in ((2, [start, alpha]), (3, [start, alpha, 0.0])):
+        found, covariance = curve_fit(
+            decay, TIME, VALUE, first, method='trf', x_scale=[start, alpha, 0.1 * start][:k],
+            xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        fits.append(DecayFit(found, np.sqrt(np.diag(covariance)),
+                             float(np.sum((decay(TIME, *found) - VALUE) ** 2))))
+    return fits[0], fits[1]
 
 
 def offset_test() -> tuple[float, float]:
@@ -123,11 +119,6 @@ def offset_test() -> tuple[float, float]:
     free = VALUE.size - 3
     test = (plain.rss - shifted.rss) / (shifted.rss / free)
     return test, float(stats.f.sf(test, 1, free))
-
-
-def local_rates() -> FloatArray:
-    """Return the rates between neighbouring points of Fig. 5, 1/s."""
-    return np.asarray(-np.diff(np.log(VALUE)) / np.diff(TIME))
 
 
 def through_coupling(time: FloatArray, rail: float) -> FloatArray:
@@ -210,7 +201,7 @@ def _fit() -> list[Row]:
 def _shape() -> list[Row]:
     line = PAPER_FIT
     found = []
-    for k, rate in enumerate(local_rates().tolist()):
+    for k, rate in enumerate((-np.diff(np.log(VALUE)) / np.diff(TIME)).tolist()):
         step = float(TIME[k + 1] - TIME[k])
         reach = line.quantile * line.scatter * math.sqrt(2.0) / step
         ends = f'{published.FIG_5_MS[k]:g}..{published.FIG_5_MS[k + 1]:g} ms'

@@ -26,7 +26,7 @@ def reproduction_document(result: Reproduction) -> Document:
         lambda: [Section('Figures, simulated from the numbers printed', [
             *_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)])],
         Section('Eight points to know when reading the paper', [
-            Text(f'{point.number}. {point.title} ({point.outcome}): {point.text}')
+            Text(f'{point.number}. {point.title} ({tally(point.rows)}): {point.text}')
             for point in result.points]),
         Section('Every number', [Text(
             'Agrees: the recomputed number rounds to the printed one, or its interval (3 standard '
