@@ -12,19 +12,13 @@ to 3 times too high.
 Once C is large enough that the network is slower than the noise, both risks fall as C rises. Below
 that C, the second rose by a factor of up to 1.44 in 39 of 6000 random networks.
 
-`network_of` chooses components that reproduce a flight. The risks of the bus are then computed by
-the model that also gives the throttle budget of `analyze`, at the end of the flight. For other
-components, the sag is scaled with the resistance, and the noise with the noise of the network. If
-a resistance or battery voltage is given, the motor current stays as computed with the recorded
-resistance, as in the rows of the table. A component that the recording does not show (the
-capacitor; without a measured current also the resistance) is taken to be the recorded craft's,
-whether it is given or the default. The risks include the errors of sag and level, and the scatter
-that throttle did not explain. Limits: sag and noise are as measured, including the white noise and
-the filter of the sensor. Noise added by changes of throttle, and an OU if one was found, count as
-slow fluctuations of the current, which capacitors on a board do not change. The rest of the noise
-is attributed to the switching of the ESCs. Without a measured current, the resistance is the given
-or default one, and the current is scaled to fit the sag. The effect of packs in parallel is then
-still right, but the effect of an ESR is uncertain.
+`network_of` chooses components that reproduce a flight; doc/theory.md says how its risks are
+computed. Limits: sag and noise are as measured, including the white noise and the filter of the
+sensor. Noise added by changes of throttle, and an OU if one was found, count as slow fluctuations
+of the current, which capacitors on a board do not change; the rest of the noise is attributed to
+the switching of the ESCs. Without a measured current, the resistance is the given or default one,
+and the current is scaled to fit the sag. The effect of packs in parallel is then still right, but
+the effect of an ESR is uncertain.
 """
 
 from __future__ import annotations
@@ -40,7 +34,6 @@ from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.online.settings import DEFAULT_LIMIT, RAIL
 from ou_monitor.paper.network import completed, PowerNetwork, Rail, rail_at
 from ou_monitor.text import number, percent
-from scipy.optimize import brentq
 from scipy.special import ndtr
 
 CELL_BROWNOUT = 3.3  # Brown-out level of a LiPo cell, V
@@ -51,8 +44,6 @@ RAIL_BROWNOUT = {
 LEAST, MOST = 10e-6, 22e-3  # Range of capacitances, F
 # Number of capacitances tried before the root is refined, because the risk may not be monotonic.
 _GRID = 81
-# Lower limit of a rate of brown-outs, 1/s.
-_NEVER = 1e-300
 # Limits of the alternatives to capacitors: maximum packs in parallel, minimum share of the present
 # resistance (new leads and a fresh pack), and of the present throttle.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
@@ -308,38 +299,34 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
               100.0 * throttle * _share(limit, 0.0 if flown is not None else _THROTTLE, target)))
 
 
+def _bisect(meets: Callable[[float], bool], good: float, bad: float, width: float) -> float:
+    """Return the value nearest to `bad`, within a width, that meets a target as `good` does."""
+    while abs(bad - good) > width:
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if meets(middle) else (good, middle)
+    return good
+
+
 def _share(risk: Callable[[float], float], least: float, target: float) -> float:
     """Return the largest share, `least` to 1, that meets the target; NaN if none does."""
     if risk(1.0) <= target:
         return 1.0
     if risk(least) > target:
         return math.nan
-    low, high = least, 1.0
-    while high - low > 1e-8:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if risk(middle) <= target else (low, middle)
-    return low
+    return _bisect(lambda share: risk(share) <= target, least, 1.0, 1e-8)
 
 
 def _least(at: Callable[[float], DesignRow], rows: list[DesignRow],
            allowed: float) -> DesignRow | None:
     """Return the first row such that all later ones are within the allowed rate, 1/s."""
-    def excess(log_capacitance: float) -> float:
-        rate = at(math.exp(log_capacitance)).rate
-        return math.log(min(max(rate, _NEVER), 1.0 / _NEVER) / allowed)
-
     above = [k for k, row in enumerate(rows) if row.rate > allowed]
     if not above:
         return rows[0]
     if above[-1] == len(rows) - 1:
         return None
     low, high = (math.log(rows[k].capacitance) for k in (above[-1], above[-1] + 1))
-    root = float(brentq(excess, low, high, xtol=1e-12))
-    # The root may lie on the wrong side by its tolerance, or at a jump of alpha between poles.
-    step = 1e-12
-    while excess(root) > 0.0 and root < high:
-        root, step = min(root + step, high), 2.0 * step
-    return at(math.exp(root))
+    return at(math.exp(_bisect(
+        lambda log: at(math.exp(log)).rate <= allowed, high, low, 1e-12)))
 
 
 def _resistance(network: PowerNetwork, throttle: float, voltage: float) -> float:

@@ -16,11 +16,10 @@ resistance -V^2/P. The random part of the ESC current is the Markov switching of
 spreads the power of a regular PWM over all frequencies: an upper bound, unless `switching_scale`
 is set from a measured rail.
 
-Effect of more bulk capacitance.  The impedance from ESC current to bus is
-|Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which falls with C at every frequency:
-Var_inf falls on both rails for noise of any colour, and so does the pole 1/((R + r) C), although
-section 4.5 of the paper says that alpha rises.  These poles are fast: with 40 mOhm, the 63 1/s of
-the paper would need 0.4 F.  Exceptions:
+More bulk capacitance lowers Var_inf on both rails for noise of any colour, because the impedance
+from ESC current to bus, |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), falls at every
+frequency; and it lowers the pole 1/((R + r) C), although section 4.5 of the paper says that alpha
+rises. Exceptions:
 
 - Slow noise.  If the noise relaxes more slowly than the pole (a small C, or flutter), alpha is the
   rate of the noise and does not depend on C.
