@@ -33,6 +33,7 @@ import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.online.settings import DEFAULT_LIMIT, RAIL
 from ou_monitor.paper.network import completed, PowerNetwork, Rail, rail_at
+from ou_monitor.records import FloatArray
 from ou_monitor.text import number, percent
 from scipy.special import ndtr
 
@@ -165,8 +166,7 @@ def with_capacitance(network: PowerNetwork, capacitance: float,
 
 def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -> DesignRow:
     """Return the numbers of a rail (sag_error: standard error of the sag of the bus, relative)."""
-    quiet = rail.var_inf == 0.0
-    mean_time, crossing = _times(rail, voltage)
+    rates = _rates(rail, voltage)
     se = sag_error * rail.load.sag if rail.name == 'bus' else 0.0
     if se > 0.0:
         # Where the uncertain mean is below the voltage, the risk is 1; integrate over the rest.
@@ -175,32 +175,32 @@ def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -
         z = lowest + 0.5 * (_FAR - lowest) * (_NODES + 1.0)
         weight = 0.5 * (_FAR - lowest) * _WEIGHTS * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
         for share, off in zip(weight.tolist() if lowest < _FAR else (), (se * z).tolist()):
-            risks += share * np.array(_risks(horizon, *_times(rail, voltage - off)))
-        rate = -np.log1p(-np.minimum(risks, 1.0 - 1e-16)) / horizon
-        mean_time, crossing = math.inf if rate[0] == 0.0 else 1.0 / float(rate[0]), float(rate[1])
+            risks -= share * np.expm1(-horizon * _rates(rail, voltage - off))
+        rates = _rate_of(risks, horizon)
     net = rail.network
-    risk_ou, risk_crossing = _risks(horizon, mean_time, crossing)
+    slow, crossing = rates.tolist()
+    risk_ou, risk_crossing = (-np.expm1(-horizon * rates)).tolist()
     return DesignRow(
         capacitance=net.bulk_capacitance, esr=net.bulk_esr, alpha=rail.alpha, tau=rail.tau,
-        sigma=0.0 if quiet else rail.sigma, var_inf=rail.var_inf, sag=rail.load.sag,
-        mean=rail.mean, mean_time=mean_time, crossing_rate=crossing, risk_ou=risk_ou,
-        risk_crossing=risk_crossing)
+        sigma=rail.sigma if rail.var_inf else 0.0, var_inf=rail.var_inf, sag=rail.load.sag,
+        mean=rail.mean, mean_time=1.0 / slow if slow else math.inf, crossing_rate=crossing,
+        risk_ou=risk_ou, risk_crossing=risk_crossing)
 
 
-def _times(rail: Rail, voltage: float) -> tuple[float, float]:
-    """Return the mean time to a voltage, s, and the crossing rate, 1/s."""
+def _rates(rail: Rail, voltage: float) -> FloatArray:
+    """Return two rates of falls below a voltage, 1/s: mean passage of the OU, and crossing."""
     if rail.mean <= voltage:
-        return 0.0, math.inf
+        return np.full(2, math.inf)
     if rail.var_inf == 0.0:
-        return math.inf, 0.0
+        return np.zeros(2)
     barrier = (rail.mean - voltage) / math.sqrt(rail.var_inf)
-    return mean_first_passage(0.0, barrier) * rail.tau, rail.crossing_rate(voltage)
+    return np.array([1.0 / (mean_first_passage(0.0, barrier) * rail.tau),
+                     rail.crossing_rate(voltage)])
 
 
-def _risks(horizon: float, mean_time: float, crossing: float) -> tuple[float, float]:
-    """Return the risks within a horizon, s: first passage of the OU, crossing rate."""
-    return (1.0 if mean_time == 0.0 else -math.expm1(-horizon / mean_time),
-            -math.expm1(-horizon * crossing))
+def _rate_of(risk: FloatArray, horizon: float) -> FloatArray:
+    """Return the rate, 1/s, that gives a risk within a horizon, s."""
+    return np.asarray(-np.log1p(-np.minimum(risk, 1.0 - 1e-16)) / horizon)
 
 
 def design(
@@ -232,7 +232,7 @@ def design(
         if flown is None:
             return row
         found = flown(throttle, 1.0, row.var_inf / own.var_inf if own.var_inf > 0.0 else 1.0)
-        rate = -math.log1p(-min(found, 1.0 - 1e-16)) / horizon
+        rate = float(_rate_of(np.array(found), horizon))
         return replace(row, mean_time=1.0 / rate if rate else math.inf, crossing_rate=rate,
                        risk_ou=found, risk_crossing=found)
 
@@ -247,7 +247,7 @@ def design(
     if present.mean <= voltage:
         verdict = DesignVerdict.LEVEL
     else:
-        least = _least(at, rows, -math.log1p(-risk) / horizon)
+        least = _least(at, rows, float(_rate_of(np.array(risk), horizon)))
         verdict = (DesignVerdict.ENOUGH if present.risk <= risk else
                    DesignVerdict.FOUND if least is not None else DesignVerdict.OUT_OF_RANGE)
     risks = [row.risk for row in rows]

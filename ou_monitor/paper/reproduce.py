@@ -17,12 +17,12 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import ACCoupling
-from ou_monitor.paper import published, tables, transient
-from ou_monitor.paper.crest import (
-    Crests, jump_rows, rows as crest_rows, simulate_crests, simulate_jumps)
+from ou_monitor.paper import published, tables
+from ou_monitor.paper.oscilloscope import (
+    CORNER_HZ, crest_rows, Crests, decay_rows, jump_rows, simulate_crests, simulate_jumps,
+    slowest_rail)
 from ou_monitor.paper.published import mean_and_error, Row, RowVerdict
 from ou_monitor.paper.tables import IntegralVariance
-from ou_monitor.paper.transient import CORNER_HZ
 from ou_monitor.records import FloatArray
 from ou_monitor.text import number
 from scipy.signal import welch
@@ -74,7 +74,7 @@ def eight_points(rows: Sequence[Row], crests: Crests) -> tuple[Point, ...]:
          f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and AC '
          'coupling is a first-order high-pass, of 10 Hz on many oscilloscopes. Behind it, the '
          'rate read is at most the corner, and hardly changes with the rail: Fig. 5 shows that '
-         f'the rail is faster than about {transient.slowest_rail():.0f} 1/s, not that it is '
+         f'the rail is faster than about {slowest_rail():.0f} 1/s, not that it is '
          f'{alpha}. Vrms would be too low as well. DC coupling, or a measured corner of the '
          'instrument, would decide.'),
         ('Fig. 5 and one exponential',
@@ -120,8 +120,6 @@ class Reproduction:
     points: tuple[Point, ...]  # The eight points
     crests: Crests  # Simulated crest factors
     spreading: IntegralVariance  # Variance of the integral of telegraph noise
-    screens: tuple[Screen, ...]  # One per load state
-    spectra: tuple[SimulatedSpectrum, ...]  # Of 10 and 40 %
 
     def parts(self) -> list[tuple[str, list[Row]]]:
         """Return the rows by table, figure and main section of the paper."""
@@ -141,12 +139,12 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
         return lambda share: report(start + share * (stop - start))
 
     # Each part has its own generator, so that none depends on the draws of another.
-    rngs = np.random.default_rng(seed).spawn(8)
+    rngs = np.random.default_rng(seed).spawn(7)
     crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
     found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
     rows = [*tables.table_1(*mean_and_error(crests.white)), *crest_rows(crests),
             *tables.table_2(), *tables.hardware_and_growth(), *jump_rows(found, crests)]
-    rows += transient.rows(rngs[2])
+    rows += decay_rows(rngs[2])
     report(0.76)
     rows += tables.probabilities(rngs[3])
     report(0.8)
@@ -154,13 +152,9 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     report(0.86)
     rows += tables.averaging_rows(rngs[5])
     spreading = tables.spreading(rngs[6], 20_000)
-    report(0.92)
-    screens = tuple(_screen(state, rngs[7]) for state in published.TABLE_1)
-    spectra = tuple(_spectrum(state, rngs[7]) for state in (published.MEDIUM, published.HIGH))
     report(1.0)
     ordered = tuple(sorted(rows, key=lambda row: _ORDER.index(row.where)))
-    return Reproduction(seed, ordered, eight_points(ordered, crests), crests, spreading,
-                        screens, spectra)
+    return Reproduction(seed, ordered, eight_points(ordered, crests), crests, spreading)
 
 
 def headline(result: Reproduction) -> str:
@@ -206,30 +200,9 @@ def _row_data(row: Row) -> dict[str, Any]:
 
 
 # Length of a drawn screen, s.
-SCREEN = 0.1
+_SCREEN = 0.1
 # Spectrum: length of the simulated recording, s, and points per decade.
 _SPECTRUM, _PER_DECADE = 2.0, 12
-
-
-@dataclass(frozen=True, eq=False)
-class Screen:
-    """One simulated oscilloscope screen."""
-
-    state: published.PrintedLoad  # Its row of Table 1
-    # Time, s, and voltage, V, in steps of the oscilloscope; shape (n,).
-    t: FloatArray
-    u: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedSpectrum:
-    """One-sided density of a load state."""
-
-    state: published.PrintedLoad  # Its row of Table 1
-    # Frequency, Hz, and density, V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
-    frequency: FloatArray
-    density: FloatArray
-    coupled: FloatArray  # Density of the same OU behind an AC coupling of 10 Hz
 
 
 def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
@@ -237,23 +210,24 @@ def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
     return np.asarray(2.0 * sigma ** 2 / (alpha ** 2 + (2.0 * math.pi * frequency) ** 2))
 
 
-def _screen(state: published.PrintedLoad, rng: np.random.Generator) -> Screen:
-    """Return a screen of a load state (motors off: with a Vrms of half a step)."""
-    t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
+def screen(state: published.PrintedLoad, rng: np.random.Generator
+           ) -> tuple[FloatArray, FloatArray]:
+    """Return times, s, and voltages, V, of one screen (motors off: with a Vrms of half a step)."""
+    t = np.arange(round(_SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     step = 1e-3 * published.VPP_STEP.size
     sigma = state.sigma or 0.5e-3 * published.VRMS_STEP.size * math.sqrt(
         2.0 * published.ALPHA.value)
-    return Screen(state, t, step * np.round(
-        simulate(t, published.ALPHA.value, sigma, rng) / step))
+    return t, step * np.round(simulate(t, published.ALPHA.value, sigma, rng) / step)
 
 
-def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> SimulatedSpectrum:
-    """Return the spectrum of a simulation at 1 MHz, evenly spaced on a log axis."""
+def spectrum(state: published.PrintedLoad, rng: np.random.Generator
+             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return frequencies, Hz, and densities, V^2/Hz: of the OU, and behind an AC coupling."""
     t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     ou = OU(published.ALPHA.value, state.sigma, 0.0)
-    plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
-    coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
-    return SimulatedSpectrum(state, plain[0], plain[1], coupled[1])
+    frequency, plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
+    _, coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
+    return frequency, plain, coupled
 
 
 def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:

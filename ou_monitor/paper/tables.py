@@ -16,6 +16,7 @@ from ou_monitor.model.ou import simulate, stationary_variance
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.design import with_capacitance
 from ou_monitor.paper.network import PowerNetwork, Rail, rail_at
+from ou_monitor.paper.oscilloscope import PAPER_FIT
 from ou_monitor.paper.published import (
     ALPHA, BATTERY_CELLS, BATTERY_V, ESC_HZ, HIGH, IDLE, LOADED, LOW, mean_and_error, MEDIUM, over,
     Printed, PrintedLoad, Range, ReadingStep, RESTATED, ROOT_2_ALPHA, Row, SAMPLING_HZ, SIGMA,
@@ -23,7 +24,6 @@ from ou_monitor.paper.published import (
 from ou_monitor.paper.theory import (
     CORRECT_FACTOR, Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem, switching_drift,
     switching_intensity)
-from ou_monitor.paper.transient import PAPER_FIT
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted, percent
 from scipy.integrate import quad
@@ -48,7 +48,6 @@ def table_1(white_crest: float, white_crest_se: float) -> list[Row]:
 
 def _multiples(name: str, known: str, step: ReadingStep, readings: Sequence[Printed],
                states: Sequence[PrintedLoad]) -> list[Row]:
-    """Return the rows of readings as multiples of the step of the oscilloscope."""
     return [Row(
         'Table 1', f'{name}, {state.label}', 'mV', reading, k * step.size,
         f'multiple of a common step of {step.low:.4g} to {step.high:.4g} mV',
@@ -370,7 +369,6 @@ def spreading(rng: np.random.Generator, paths: int) -> IntegralVariance:
 
 
 def switching_rows(rng: np.random.Generator, paths: int = 20_000) -> list[Row]:
-    """Return the rows of formulas (4) to (6)."""
     return [_potential(), *_intensity(rng, paths), *_drift(rng, paths)]
 
 

@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.curves import outline
-from ou_monitor.paper import published, transient
+from ou_monitor.paper import oscilloscope, published
 from ou_monitor.paper.published import Row
 from ou_monitor.paper.reproduce import (
-    headline, lorentzian, recomputed, Reproduction, tally)
+    headline, lorentzian, recomputed, Reproduction, screen, spectrum, tally)
 from ou_monitor.paper.tables import share_above
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text)
@@ -23,8 +23,7 @@ _BINS = 40  # Of the histogram of crest factors
 
 def reproduction_document(result: Reproduction) -> Document:
     parts: list[Part] = [
-        lambda: [Section('Figures, simulated from the numbers printed', [
-            *_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)])],
+        partial(_figures, result),
         Section('Eight points to know when reading the paper', [
             Text(f'{point.number}. {point.title} ({tally(point.rows)}): {point.text}')
             for point in result.points]),
@@ -53,18 +52,25 @@ def _explanations(rows: Sequence[Row]) -> list[Part]:
     return [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 
 
-def _screens(result: Reproduction) -> list[Part]:
+def _figures(result: Reproduction) -> list[Part]:
+    # The eighth, after those of the rows.
+    rng = np.random.default_rng(result.seed).spawn(8)[-1]
+    return [Section('Figures, simulated from the numbers printed', [
+        *_screens(rng), *_transient(), *_spectrum(rng), *_crest_and_factor(result)])]
+
+
+def _screens(rng: np.random.Generator) -> list[Part]:
     drawn = []
-    for k, screen in enumerate(result.screens):
-        state = screen.state
+    for k, state in enumerate(published.TABLE_1):
+        t, u = screen(state, rng)
         plot = Plot(f'{state.label}: one OU', 'time, ms', 'mV', width=450, height=230)
         half = 0.5 * state.vpp.value
-        plot.limits(x=(0.0, 1e3 * float(screen.t[-1])), y=(-1.3 * half, 1.3 * half))
-        plot.line(1e3 * screen.t, 1e3 * screen.u, colour=k)
+        plot.limits(x=(0.0, 1e3 * float(t[-1])), y=(-1.3 * half, 1.3 * half))
+        plot.line(1e3 * t, 1e3 * u, colour=k)
         for sign, label in ((1.0, 'Vpp as printed'), (-1.0, '')):
-            plot.level((0.0, 1e3 * float(screen.t[-1])), sign * half, label, 7)
+            plot.level((0.0, 1e3 * float(t[-1])), sign * half, label, 7)
         drawn.append(Figure(
-            plot, f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
+            plot, f'Vpp {1e3 * float(np.ptp(u)):.4g} mV here, '
             f'{state.vpp.text} mV printed.'))
     return [Pair(drawn), Text(
         'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step of the '
@@ -73,16 +79,16 @@ def _screens(result: Reproduction) -> list[Part]:
 
 
 def _transient() -> list[Part]:
-    line = transient.PAPER_FIT
-    plain, shifted = transient.decay_fits()
+    line = oscilloscope.PAPER_FIT
+    plain, shifted = oscilloscope.decay_fits()
     t = np.linspace(0.0, 0.055, 221)
-    rail = transient.TYPICAL_RAIL
-    behind, worst = transient.fitted_through_coupling(t)
+    rail = oscilloscope.TYPICAL_RAIL
+    behind, worst = oscilloscope.fitted_through_coupling(t)
     curves = (
         (line.start * np.exp(-line.alpha * t), f'ln fit to 35 ms, {line.alpha:.1f} 1/s', 'thick'),
         (plain(t), f'exponential, {plain.parameters[1]:.1f} 1/s', ''),
         (shifted(t), f'with offset, {shifted.parameters[1]:.1f} 1/s', 'thick'),
-        (behind, f'rail of {rail:g} 1/s behind {transient.CORNER_HZ:g} Hz', 'dash'))
+        (behind, f'rail of {rail:g} 1/s behind {oscilloscope.CORNER_HZ:g} Hz', 'dash'))
     drawn = []
     for log in (False, True):
         plot = Plot('Fig. 5: decay after 20 %' + (', log scale' if log else ''), 'time, ms',
@@ -90,29 +96,28 @@ def _transient() -> list[Part]:
         plot.limits(x=(-1.5, 55.0), y=(3.0, 600.0) if log else (-10.0, 420.0))
         for k, (y, label, style) in enumerate(curves):
             plot.line(1e3 * t, np.where(y > 0.0, y, math.nan) if log else y, label, k, style)
-        plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
+        plot.markers(1e3 * oscilloscope.TIME, oscilloscope.VALUE, 'points of Fig. 5', 7)
         drawn.append(Figure(plot))
     return [Pair(drawn), Text(
         f'Dashed: a rail {rail / published.ALPHA.value:.0f} times faster, behind an AC '
-        f'coupling of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four '
+        f'coupling of {oscilloscope.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four '
         'points of the fit. The last point lies below it and below both exponentials.',
         legend=True)]
 
 
-def _spectrum(result: Reproduction) -> list[Part]:
+def _spectrum(rng: np.random.Generator) -> list[Part]:
     plot = Plot('Spectrum of the OU', 'frequency, Hz', 'PSD, V\u00b2/Hz', height=320, log_x=True,
                 log_y=True)
     wide = np.geomspace(1.0, 5e5, 200)
     lines = []
-    for k, found in enumerate(result.spectra):
-        state = found.state
+    for k, state in enumerate((published.MEDIUM, published.HIGH)):
+        frequency, density, coupled = spectrum(state, rng)
         curve = lorentzian(wide, published.ALPHA.value, state.sigma)
-        lines += [curve, found.density]
-        plot.line(found.frequency, found.density, f'{state.label}, simulated', k, 'faint')
+        lines += [curve, density]
+        plot.line(frequency, density, f'{state.label}, simulated', k, 'faint')
         plot.line(wide, curve, f'{state.label}, Lorentzian', k, 'dash thick')
-        if state is published.HIGH:
-            plot.line(found.frequency, found.coupled,
-                      f'{state.label}, behind {transient.CORNER_HZ:g} Hz coupling', 2)
+    plot.line(frequency, coupled,
+              f'{state.label}, behind {oscilloscope.CORNER_HZ:g} Hz coupling', 2)
     plot.limits(x=(1.0, 5e5), y=span(lines, log=True))
     plot.mark(published.ALPHA.value / (2.0 * math.pi), 'alpha/2\u03c0 = 10.03 Hz')
     low, high = published.ESC_HZ

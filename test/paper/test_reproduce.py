@@ -5,7 +5,7 @@ import math
 import re
 
 import numpy as np
-from ou_monitor.paper import crest, published, tables, transient
+from ou_monitor.paper import oscilloscope, published, tables
 from ou_monitor.paper.network import PowerNetwork
 from ou_monitor.paper.published import Printed, Row, RowVerdict
 import pytest
@@ -90,7 +90,7 @@ def first_table():
 @pytest.fixture(scope='module')
 def fig5():
     """Return the rows of Fig. 5; few simulations, since others test them."""
-    return by_quantity(transient.rows(np.random.default_rng(1), draws=30))
+    return by_quantity(oscilloscope.decay_rows(np.random.default_rng(1), draws=30))
 
 
 def test_steps_of_the_oscilloscope():
@@ -144,7 +144,7 @@ def test_exponents_of_growth_agree_with_brute_force():
 
 def test_alpha_by_least_squares(fig5):
     """By the normal equations; 4.303 is the 97.5 % quantile of t with 2 degrees of freedom."""
-    line = transient.PAPER_FIT
+    line = oscilloscope.PAPER_FIT
     assert (line.alpha, line.alpha_se, line.scatter) == pytest.approx(
         (63.0458, 1.24557, 0.0335379), rel=1e-5)
     assert line.half_width == pytest.approx(4.3027 * line.alpha_se, rel=1e-4)
@@ -165,17 +165,17 @@ def test_only_one_local_rate_is_off_by_more_than_scatter(fig5):
 
 def test_the_exponential_with_offset_is_the_best():
     """No neighbour has smaller residuals; 56.5 1/s, -14.7 mV, 7.4 times."""
-    plain, shifted = transient.decay_fits()
+    plain, shifted = oscilloscope.decay_fits()
     for fit in (plain, shifted):
         for k, step in itertools.product(range(len(fit.parameters)), (0.999, 1.001)):
             other = fit.parameters.copy()
             other[k] *= step
-            left = transient.VALUE - transient.decay(transient.TIME, *other)
+            left = oscilloscope.VALUE - oscilloscope.decay(oscilloscope.TIME, *other)
             assert np.sum(left ** 2) > fit.rss
     assert shifted.parameters[1:] == pytest.approx([56.5, -14.7], abs=0.05)
     assert plain.rss / shifted.rss == pytest.approx(7.41, abs=0.01)
     # With (1, 2) degrees of freedom P(F > f) = 1 - sqrt(f / (f + 2)).
-    test, p = transient.offset_test()
+    test, p = oscilloscope.offset_test()
     assert test == pytest.approx(2.0 * (plain.rss / shifted.rss - 1.0))
     assert p == pytest.approx(1.0 - math.sqrt(test / (test + 2.0)))
 
@@ -187,17 +187,17 @@ def test_a_step_through_the_coupling_agrees_with_simulation(rail):
     t = np.linspace(0.0, 0.05, 5001)
     # s/(s + w) of a step that rises as rail/(s + rail).
     _, y, _ = lsim(([rail, 0.0], [1.0, rail + w, rail * w]), np.ones(t.size), t)
-    assert transient.through_coupling(t, rail) == pytest.approx(y, abs=1e-6)
+    assert oscilloscope.through_coupling(t, rail) == pytest.approx(y, abs=1e-6)
 
 
 def test_coupling_hides_the_rail():
     """Without noise: never above the corner, and near it for every fast rail."""
     w = 2.0 * math.pi * 10.0
-    rates = [transient.fitted_rate(rail) for rail in (20.0, 100.0, 300.0, 1e3, 1e4, 1e6)]
+    rates = [oscilloscope.fitted_rate(rail) for rail in (20.0, 100.0, 300.0, 1e3, 1e4, 1e6)]
     assert rates == sorted(rates) and rates[-1] < w
     assert rates[-1] == pytest.approx(w, rel=1e-3) and rates[0] < 25.0
-    line = transient.PAPER_FIT
-    assert transient.fitted_rate(transient.slowest_rail()) == pytest.approx(
+    line = oscilloscope.PAPER_FIT
+    assert oscilloscope.fitted_rate(oscilloscope.slowest_rail()) == pytest.approx(
         line.alpha - line.half_width)
 
 
@@ -307,7 +307,7 @@ def formulas():
 @pytest.fixture(scope='module')
 def crests():
     """Return simulated crest factors; 600 segments."""
-    return crest.simulate_crests(np.random.default_rng(12), 600)
+    return oscilloscope.simulate_crests(np.random.default_rng(12), 600)
 
 
 def long_run_rate(q, c):
@@ -397,7 +397,7 @@ def test_crest_factors_are_those_of_1_mhz(crests):
 
 def test_verdicts_on_the_crest_factors(crests):
     """40 % agrees, 5 % only within its rounding; 10 % by what the screens say, either way."""
-    low, medium, high = crest.rows(crests)
+    low, medium, high = oscilloscope.crest_rows(crests)
     assert (low.verdict, high.verdict) == (RowVerdict.ROUNDING, RowVerdict.AGREES)
     # (225 - 3.1) / (28.1 + 4.7), the least that the readings allow.
     least = (225.0 - 3.125) / (28.1 + 4.69)
@@ -408,14 +408,14 @@ def test_verdicts_on_the_crest_factors(crests):
 
 def test_jumps_raise_the_crest_factor_of_long_screens(crests):
     """Beyond the OU on 500 ms; rows name what was best, and size gives back the variance."""
-    found = crest.simulate_jumps(np.random.default_rng(17), 20.0)
-    best = crest.largest(found, 500)
+    found = oscilloscope.simulate_jumps(np.random.default_rng(17), 20.0)
+    best = oscilloscope.largest(found, 500)
     assert best.mean == max(c.mean for c in found if c.screen == 500)
     assert best.mean - crests.mean(500)[0] > 5.0 * best.error
     share = best.size(1.0) ** 2 * best.rate / (2.0 * published.ALPHA.value)
     assert share == pytest.approx(best.share)
-    rows = crest.jump_rows(found, crests)
+    rows = oscilloscope.jump_rows(found, crests)
     assert len(rows) == 5
     assert rows[0].recomputed == pytest.approx((287.5 / 56.3) / (81.3 / 9.38))
-    assert crest.impulse_height(published.LOW, crests) == pytest.approx(
+    assert oscilloscope.impulse_height(published.LOW, crests) == pytest.approx(
         81.3 - 9.38 * crests.mean(100)[0])
