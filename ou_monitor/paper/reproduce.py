@@ -212,7 +212,7 @@ def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
 
 def screen(state: published.PrintedLoad, rng: np.random.Generator
            ) -> tuple[FloatArray, FloatArray]:
-    """Return times, s, and voltages, V, of one screen (motors off: with a Vrms of half a step)."""
+    """Return times, s, and voltages, V, of a drawing (motors off: a Vrms of half a step)."""
     t = np.arange(round(_SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     step = 1e-3 * published.VPP_STEP.size
     sigma = state.sigma or 0.5e-3 * published.VRMS_STEP.size * math.sqrt(
