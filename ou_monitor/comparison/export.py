@@ -217,10 +217,9 @@ def _simulated(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatAr
 def _explained_words(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
     notes = []
     for words, one in (('the model', model), ('the exported part', left)):
-        found = compare(recording, one, seeds=_SEEDS).as_data()
-        path, lowest = found['mean_path'], found['lowest_v']
+        found = compare(recording, one, seeds=_SEEDS)
         notes.append(
-            f"{words}: explains {100.0 * max(path['variance_explained'], 0.0):.0f} % of "
-            f"{recording.name}, lowest voltage {lowest['simulated_median']:.2f} V (measured "
-            f"{lowest['measured']:.2f} V), {found['verdict']}")
+            f'{words}: explains {100.0 * max(found.explained, 0.0):.0f} % of {recording.name}, '
+            f'lowest voltage {found.lowest.median:.2f} V (measured {found.lowest.measured:.2f} '
+            f'V). {found.verdict.value}')
     return notes
