@@ -516,16 +516,18 @@ _QUIET, _INTERVALS = 1.0, 10.0
 def held_words(t: FloatArray, seen: FloatArray) -> str:
     """Return a note if throttle has no new value for long; empty if not (t, seen: stamps, s)."""
     # t: of the voltage; seen: of the throttle values.
-    t, seen = t[np.isfinite(t)], np.sort(seen[np.isfinite(seen)])
-    if seen.size < 2 or not t.size:
+    known, seen = np.isfinite(t), np.sort(seen[np.isfinite(seen)])
+    if seen.size < 2 or not known.any():
         return ''
-    gaps = np.diff(np.append(seen, max(float(t.max()), float(seen[-1]))))
+    # Not t[known], a copy of which would be the largest memory of a long bag.
+    first, last = t.min(where=known, initial=math.inf), t.max(where=known, initial=-math.inf)
+    gaps = np.diff(np.append(seen, max(float(last), float(seen[-1]))))
     long = gaps > max(_QUIET, _INTERVALS * float(np.median(gaps)))
     if not long.any():
         return ''
     at = int(np.argmax(gaps))
     return (f'Throttle has no new value for {float(gaps[long].sum()):.3g} s in all, the '
-            f'longest time from {float(seen[at] - t.min()):.4g} s on: its last value '
+            f'longest time from {float(seen[at] - first):.4g} s on: its last value '
             'is held there. If it moved meanwhile, what is said of throttle is wrong.')
 
 
