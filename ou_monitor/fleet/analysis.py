@@ -94,7 +94,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
             'levels': [_level(level, options) for level in analysis.levels],
             'notes': list(analysis.notes), 'damage': [
                 note for note in recording.notes if defect_of(note) is Defect.DAMAGED_FILE],
-            **_discovery(recording, options)}
+            **(_discovery(recording, options.seed) if options.discover else {})}
 
 
 def _level(level: LevelResult, options: Options) -> dict[str, Any]:
@@ -126,11 +126,9 @@ def _facts(found: Overview) -> dict[str, float]:
         'resistance': found.facts.resistance.ohm, 'resistance_se': found.facts.resistance.se_ohm}
 
 
-def _discovery(recording: Recording, options: Options) -> dict[str, Any]:
-    if not options.discover:
-        return {'verdict': None, 'causes': None, 'gain': NAN, 'gain_se': NAN}
+def _discovery(recording: Recording, seed: int) -> dict[str, Any]:
     from ou_monitor.discovery.discover import discover
 
-    finding = discover(recording, seed=options.seed)
+    finding = discover(recording, seed=seed)
     return {'verdict': finding.verdict.value, 'causes': [cause.name for cause in finding.causes],
             'gain': finding.gain, 'gain_se': finding.gain_se}

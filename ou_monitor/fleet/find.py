@@ -3,11 +3,12 @@ Find recordings: files, bags, and folders that contain them.
 
 Limits: links to folders are not followed, and hidden folders are skipped.  A FIFO, a device or a
 broken link with the name of a recording counts as an unreadable recording.  Two recordings are
-duplicates if all bytes of their data are equal; so a recompressed copy is not a duplicate.
+duplicates if all bytes of their data files are equal; so a recompressed copy is not a duplicate.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from ou_monitor.recordings.bag import FILE, is_part
 from ou_monitor.recordings.importers.csv_table import holds_supply
 from ou_monitor.recordings.importers.formats import BAG, CSV, kind_of
 from ou_monitor.stream.files import open_regular
-from ou_monitor.text import printable
+from ou_monitor.text import counted, printable
 
 # Endings of autopilot logs; the first bytes decide whether a file is one.
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
@@ -30,7 +31,6 @@ _COMMON = ('', '.log', '.txt')
 # Files that are noted as skipped: what they are, and why.
 _CSV = '.csv file', 'without columns of time and voltage'
 _LOG = 'file', 'with the ending of a log, but in no known format'
-_BLOCK = 1 << 20  # Bytes read at once for the digest
 _MOST_DEPTH = 50  # Maximum depth of the folders searched
 
 
@@ -76,8 +76,8 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Sear
                     skipped[kind].append(found)
         else:
             paths.add(_real(path.parent if path.name == FILE else path))
-    notes = [f"{len(files)} {what}{'' if len(files) == 1 else 's'} skipped, such as '{files[0]}': "
-             f'{why}.' for (what, why), files in skipped.items() if files]
+    notes = [f"{counted(len(files), what)} skipped, such as '{files[0]}': {why}."
+             for (what, why), files in skipped.items() if files]
     notes += [f'The folder {text} cannot be searched.' for text in closed]
     if not paths:
         where = ', '.join(f"'{text}'" for text in given)
@@ -175,37 +175,31 @@ def _source(path: Path) -> FoundRecording:
 def duplicates(sources: Sequence[FoundRecording],
                progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
     """Return duplicate -> original: the oldest recording with equal data (progress: 0..1)."""
-    sizes: dict[int, list[FoundRecording]] = {}
-    for source in sources:
-        if source.size:
-            sizes.setdefault(source.size, []).append(source)
-    alike = [source for group in sizes.values() if len(group) > 1 for source in group]
+    sizes = Counter(source.size for source in sources)
+    alike = [source for source in sources if source.size and sizes[source.size] > 1]
     total = sum(source.size for source in alike)
     done = 0
-    first: dict[bytes, Path] = {}
+    first: dict[tuple[bytes, ...], Path] = {}
     found: dict[Path, Path] = {}
     for source in sorted(alike, key=lambda s: (max(s.stamp[::2], default=0), str(s.path))):
         digest = _digest(source)
         done += source.size
         if progress is not None:
             progress(done / total)
-        if digest is None:
-            continue
         if digest in first:
             found[source.path] = first[digest]
-        else:
+        elif digest is not None:
             first[digest] = source.path
     return found
 
 
-def _digest(source: FoundRecording) -> bytes | None:
-    """Return a hash of the data; None if unreadable (the reader reports it)."""
-    digest = hashlib.blake2b()
+def _digest(source: FoundRecording) -> tuple[bytes, ...] | None:
+    """Return a hash of each data file; None if unreadable (the reader reports it)."""
+    found = []
     try:
         for path in source.files:
             with open_regular(path) as file:
-                while block := file.read(_BLOCK):
-                    digest.update(block)
+                found.append(hashlib.file_digest(file, 'blake2b').digest())
     except OSError:
         return None
-    return digest.digest()
+    return tuple(found)

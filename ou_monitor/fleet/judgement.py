@@ -13,10 +13,6 @@ Drift: a line through the logarithms against flight number.  Weights come from t
 normal scatter between flights (Paule and Mandel).  The scale of the t test is the scatter about
 the line, so an error common to all flights does not count.
 
-Few vehicles: if fewer than `LEAST_VEHICLES` have packs of the same number of cells, resistance and
-sag of each are compared with the mean of the others by a t test, scaled by the pooled scatter
-between flights.
-
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
 divided by sqrt(s^2 + se^2).  se is the standard error of the value, s the scatter between
 recordings (a median absolute deviation).  The bound is a quantile of the largest score in
@@ -33,9 +29,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.analysis.level_tests import adjusted
 from ou_monitor.online.load.current_filter import LEAST_ERROR
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.text import Z95
+from scipy import stats
 
 Row = Mapping[str, Any]
 IntArray = npt.NDArray[np.intp]
@@ -94,14 +91,9 @@ class Values:
     cells: IntArray  # Number of cells that each value is divided by; 0: not divided; shape (n,)
     months: FloatArray  # Dates, months since 1970; NaN where unknown; shape (n,)
 
-    def shown(self, value: FloatArray | float) -> FloatArray:
-        """Convert logarithms, as in the field `value`, to the unit of the quantity."""
-        return np.asarray(np.exp(np.asarray(value, dtype=np.float64)))
-
-    def interval(self) -> tuple[FloatArray, FloatArray]:
-        """Return the ends of the 95 % intervals in the unit of the quantity."""
-        reach = Z95 * self.error
-        return self.shown(self.value - reach), self.shown(self.value + reach)
+    def of(self, vehicle: str) -> npt.NDArray[np.bool_]:
+        """Return which values are of a vehicle, shape (n,)."""
+        return np.asarray(np.array(self.vehicles, dtype=str) == vehicle)
 
 
 def values_of(rows: Sequence[Row], name: str) -> Values:
@@ -283,7 +275,6 @@ class Trend:
 
 def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
     """Test every vehicle and quantity with enough flights."""
-    from ou_monitor.analysis.level_tests import adjusted
     found = [trend for values in all_values for trend in _trends_of(values)]
     done = [replace(trend, p_family=p) for trend, p in zip(
         found, adjusted([trend.p_value for trend in found]))]
@@ -291,13 +282,9 @@ def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
 
 
 def _trends_of(values: Values) -> list[Trend]:
-    # Imported here, because the import takes a second and the workers do not need it.
-    from scipy import stats
-
     found = []
-    names = np.array(values.vehicles, dtype=str)
     for name in sorted(set(values.vehicles) - {''}):
-        mine = np.flatnonzero((names == name) & (values.flights > 0))
+        mine = np.flatnonzero(values.of(name) & (values.flights > 0))
         if mine.size < LEAST_FLIGHTS:
             continue
         mine = mine[np.argsort(values.flights[mine])]
@@ -502,17 +489,12 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
         trend = np.zeros(one.value.size)
         for t in drifting:
             if t.quantity == name:
-                mine = _is_of_vehicle(one, t.vehicle) & (one.flights > 0)
+                mine = one.of(t.vehicle) & (one.flights > 0)
                 trend[mine] = t.line(one.flights[mine].astype(np.float64)) - t.line(np.array(
                     0.5 * (t.first + t.last)))
         recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend, seed=seed)
         vehicles[name] = _compare_vehicles(one, recordings[name], one.value - trend, rate, seed)
     return Judgement(values, tested, recordings, vehicles)
-
-
-def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
-    mine: npt.NDArray[np.bool_] = np.array(values.vehicles, dtype=str) == vehicle
-    return mine
 
 
 def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int
@@ -521,7 +503,7 @@ def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: 
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))
-    of = [np.flatnonzero(_is_of_vehicle(values, name)) for name in names]
+    of = [np.flatnonzero(values.of(name)) for name in names]
     for k, mine in enumerate(of):
         value[k] = np.median(values.value[mine])
         one = np.sqrt(np.mean(scatter ** 2 + values.error[mine] ** 2) / mine.size)
@@ -542,9 +524,6 @@ def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: 
 def _judge_few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
     """Compare the mean of each of a few vehicles (two flights or more) with the others' mean."""
     # The null hypothesis is a difference of at most `_TOLERANCE`, either way.
-    from ou_monitor.analysis.level_tests import adjusted
-    from scipy import stats
-
     freedom = sum(one.size - 1 for one in flights)
     squares = sum(float(((one - one.mean()) ** 2).sum()) for one in flights)
     if not squares > 0.0:

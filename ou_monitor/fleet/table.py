@@ -108,29 +108,26 @@ COLUMNS = (
     Column('size_bytes', 'count', 'byte', 'size of the recording on disk'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
-# Columns that are set separately, not copied from the result of the recording.
-_OTHERWISE = ('vehicle', 'start', 'error')
 
 
 def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
             flight: int | None, duplicate_of: Path | None = None) -> list[Row]:
     """Return the rows of one recording: one per level, or one with the error."""
-    base: Row = dict.fromkeys(NAMES)
+    base: Row = {**dict.fromkeys(NAMES), 'recording': printable(source.path.name)}
+    levels: list[dict[str, Any]] = [{}]
+    if duplicate_of is None and not result['error']:
+        start = result['start']
+        base.update({name: value for name, value in result.items() if name in base})
+        base['start'] = (datetime.fromtimestamp(start, timezone.utc)
+                         if math.isfinite(start) else None)
+        levels = result['levels'] or levels
     base.update(
         vehicle=vehicle.name or None, vehicle_from=vehicle.named_by if vehicle.name else None,
-        flight=flight, path=printable(source.path), recording=printable(source.path.name),
+        flight=flight, path=printable(source.path), start_from=base['start_from'] or None,
         size_bytes=source.size, error=result['error'] or None,
         duplicate_of=None if duplicate_of is None else printable(duplicate_of))
-    if duplicate_of is not None or result['error']:
-        return [base]
-    base.update({name: _null_if_unknown(value) for name, value in result.items()
-                 if name in base and name not in _OTHERWISE})
-    base['start_from'] = result['start_from'] or None
-    start = result['start']
-    base['start'] = (datetime.fromtimestamp(start, timezone.utc)
-                     if math.isfinite(start) else None)
-    return [{**base, **{name: _null_if_unknown(value) for name, value in level.items()}}
-            for level in result['levels'] or [{}]]
+    return [{name: _null_if_unknown(value) for name, value in {**base, **level}.items()}
+            for level in levels]
 
 
 def _null_if_unknown(value: Any) -> Any:

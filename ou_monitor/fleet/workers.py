@@ -30,8 +30,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.mcap_file import usable_memory
 
 # Several processes are slower with several threads of linear algebra each than with one each.
-_ONE_THREAD = dict.fromkeys(
-    ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
+_ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 # Share of the memory that all workers together may use, and the minimum for one, bytes.
 _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
 # Timeout for an answer of a scheduler or a worker, s.

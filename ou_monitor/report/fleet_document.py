@@ -18,7 +18,7 @@ from ou_monitor.records import FloatArray, NAN, Severity
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, counted, number, p_words, some, volts
+from ou_monitor.text import chance, counted, number, p_words, some, volts, Z95
 
 _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
            'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1'}
@@ -250,7 +250,7 @@ def _prefix(row: Row) -> str:
 
 def _without_unit(values: Values, value: float | FloatArray) -> str:
     """Return one value without its unit; resistance and sag in thousandths (mOhm, mV)."""
-    return number(_thousandths(values.name) * float(values.shown(value)))
+    return number(_thousandths(values.name) * math.exp(value))
 
 
 def _thousandths(name: str) -> float:
@@ -457,7 +457,7 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
 
 def _vehicle_value(judged: Judgement, name: str, vehicle: str) -> float:
     one = judged.vehicles[name]
-    return (float(judged.values[name].shown(one.value[one.names.index(vehicle)]))
+    return (math.exp(one.value[one.names.index(vehicle)])
             if vehicle in one.names else NAN)
 
 
@@ -590,18 +590,17 @@ def _drift(fleet: Fleet) -> list[Part]:
 
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:
-    mine = np.array([v == trend.vehicle for v in values.vehicles]) & (values.flights > 0)
-    x, y = values.flights[mine].astype(float), values.value[mine]
-    low, high = values.interval()
+    mine = values.of(trend.vehicle) & (values.flights > 0)
+    x, y, reach = values.flights[mine].astype(float), values.value[mine], Z95 * values.error[mine]
     scale = _thousandths(values.name)
     cell = ' per cell' * bool(values.cells[mine].all())
     plot = Plot(f'{trend.vehicle}: {_TITLES[values.name]}{cell}', 'flight', _UNITS[values.name],
                 width=450, height=260, log_y=True)
     plot.limits(x=(trend.first - 0.5, trend.last + 0.5))
-    plot.bars(x, scale * low[mine], scale * high[mine], '', 7)
-    plot.markers(x, scale * values.shown(y), '', 0)
+    plot.bars(x, scale * np.exp(y - reach), scale * np.exp(y + reach), '', 7)
+    plot.markers(x, scale * np.exp(y), '', 0)
     at = np.linspace(trend.first, trend.last, 50)
-    return plot.line(at, scale * values.shown(trend.line(at)), '', 1, 'thick')
+    return plot.line(at, scale * np.exp(trend.line(at)), '', 1, 'thick')
 
 
 def _causes(fleet: Fleet) -> list[Part]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 import os
 from pathlib import Path
 import re
@@ -44,7 +45,7 @@ def plain_texts(found: Any) -> dict[str, str]:
             for key, value in list(found.items())[:1000]}
 
 
-def open_regular(path: str | Path) -> BinaryIO:
+def open_regular(path: str | Path) -> BufferedReader:
     """Open a file to read, never waiting for a FIFO; OSError if it is not a regular file."""
     file = open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
