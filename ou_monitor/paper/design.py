@@ -167,7 +167,7 @@ def with_capacitance(network: PowerNetwork, capacitance: float,
 def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -> DesignRow:
     """Return the numbers of a rail (sag_error: standard error of the sag of the bus, relative)."""
     rates = _rates(rail, voltage)
-    se = sag_error * rail.load.sag if rail.name == 'bus' else 0.0
+    se = sag_error * rail.sag if rail.name == 'bus' else 0.0
     if se > 0.0:
         # Where the uncertain mean is below the voltage, the risk is 1; integrate over the rest.
         lowest = max((voltage - rail.mean) / se, -_FAR)
@@ -182,7 +182,7 @@ def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -
     risk_ou, risk_crossing = (-np.expm1(-horizon * rates)).tolist()
     return DesignRow(
         capacitance=net.bulk_capacitance, esr=net.bulk_esr, alpha=rail.alpha, tau=rail.tau,
-        sigma=rail.sigma if rail.var_inf else 0.0, var_inf=rail.var_inf, sag=rail.load.sag,
+        sigma=rail.sigma if rail.var_inf else 0.0, var_inf=rail.var_inf, sag=rail.sag,
         mean=rail.mean, mean_time=1.0 / slow if slow else math.inf, crossing_rate=crossing,
         risk_ou=risk_ou, risk_crossing=risk_crossing)
 

@@ -160,40 +160,14 @@ class PowerNetwork:
 UNITS = {part.name: part.metadata['unit'] for part in fields(PowerNetwork)}
 
 
-@dataclass(frozen=True)
-class Load:
-    """The load and the mean voltages at one throttle."""
-
-    current: float  # Mean current of the motors, A.
-    # Random ESC current: rms, A, and rate of its exponential covariance, 1/s.
-    switching_rms: float
-    switching_rate: float
-    flutter_rms: float  # Rms of the slow fluctuation of the current, A.
-    # Mean voltages, V.
-    bus: float
-    regulated: float
-    sag: float  # Battery voltage less the mean of the bus, V.
-    input_conductance: float  # Incremental P/V^2 of the regulator, 1/Ohm.
-
-
-def load_at(network: PowerNetwork, throttle: float) -> Load:
-    """Return the load at a throttle."""
-    # An ESC draws the phase current I_m during the on-time of its PWM only, so its mean is
-    # I = D I_m with the duty D = throttle. As a telegraph process with f cycles per second it has
-    # the variance I_m^2 D (1 - D) and a covariance that decays at f / (D (1 - D)).
+def _operating_point(network: PowerNetwork, throttle: float) -> tuple[float, float]:
+    """Return the mean current of the motors, A, and the mean of the bus, V, at a throttle."""
     if not 0.0 <= throttle <= 1.0:
         raise ValueError(f'throttle must be within 0..1, got {throttle}')
-    current = network.current_at(throttle)
-    duty = min(max(throttle, LEAST_DUTY), 1.0 - LEAST_DUTY)
-    # Phase current of one ESC; zero duty has no current and no noise.
-    phase = current / throttle / network.escs if throttle > 0.0 else 0.0
-    rms = network.switching_scale * phase * math.sqrt(
-        network.escs * throttle * (1.0 - throttle))
-    power = network.regulator_power
-    resistance = network.battery_resistance
+    current, resistance = network.current_at(throttle), network.battery_resistance
     # The bus v solves v = V - R (I + P/v); at the larger solution the network is stable.
     free = network.battery_voltage - resistance * current
-    root = free**2 - 4.0 * resistance * power
+    root = free**2 - 4.0 * resistance * network.regulator_power
     bus = (free + math.sqrt(root)) / 2.0 if free > 0.0 and root >= 0.0 else 0.0
     if bus <= network.regulator_voltage:
         raise ValueError(
@@ -201,13 +175,7 @@ def load_at(network: PowerNetwork, throttle: float) -> Load:
             f'through battery_resistance {resistance:g} Ohm drops {resistance * current:.4g} V of '
             f'{network.battery_voltage:g} V, and at least {network.regulator_voltage:g} V must '
             'remain')
-    return Load(
-        current=current, switching_rms=rms,
-        switching_rate=network.esc_frequency / (duty * (1.0 - duty)),
-        flutter_rms=network.flutter * current, bus=bus,
-        regulated=network.regulator_voltage - network.regulator_resistance * network.mcu_current,
-        sag=network.battery_voltage - bus,
-        input_conductance=power / bus**2)
+    return current, bus
 
 
 @dataclass(frozen=True)
@@ -215,18 +183,14 @@ class Rail:
     """One rail at one throttle, as `rail_at` returns it."""
 
     network: PowerNetwork  # Components.
-    load: Load  # Load and mean voltages.
     name: str  # ``bus`` or ``regulated``.
+    mean: float  # Mean voltage of the rail, V.
+    sag: float  # Battery voltage less the mean of the bus, V.
     # dx = a x dt + b dW for the states x (voltages, V, and currents, A); the deviation of the rail
     # from its mean, V, is c x.
     a: FloatArray
     b: FloatArray
     c: FloatArray
-
-    @property
-    def mean(self) -> float:
-        """Mean voltage of the rail, V."""
-        return self.load.bus if self.name == 'bus' else self.load.regulated
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -285,20 +249,32 @@ def rail_at(network: PowerNetwork, throttle: float, rail: str = 'bus') -> Rail:
         raise ValueError(f"rail must be 'bus' or 'regulated', got {rail!r}")
     if rail == 'regulated' and not network.regulator_voltage:
         raise ValueError('there is no regulated rail: regulator_voltage is 0')
-    load = load_at(network, throttle)
-    a, outputs = _circuit(network, load.input_conductance)
+    current, bus = _operating_point(network, throttle)
+    # An ESC draws the phase current I_m during the on-time of its PWM only, so its mean is
+    # I = D I_m with the duty D = throttle. As a telegraph process with f cycles per second it has
+    # the variance I_m^2 D (1 - D) and a covariance that decays at f / (D (1 - D)). At a duty of
+    # zero there is no current and no noise.
+    duty = min(max(throttle, LEAST_DUTY), 1.0 - LEAST_DUTY)
+    phase = current / throttle / network.escs if throttle > 0.0 else 0.0
+    switching = network.switching_scale * phase * math.sqrt(
+        network.escs * throttle * (1.0 - throttle))
+    a, outputs = _circuit(network, network.regulator_power / bus**2)
     b = np.zeros((a.shape[0], len(SOURCES)))
-    rms = (load.switching_rms, load.flutter_rms, network.mcu_noise)
-    rates = (load.switching_rate, network.flutter_rate, network.mcu_noise_rate)
-    for k, (size, rate) in enumerate(zip(rms, rates)):
+    for k, (rms, rate) in enumerate((
+            (switching, network.esc_frequency / (duty * (1.0 - duty))),
+            (network.flutter * current, network.flutter_rate),
+            (network.mcu_noise, network.mcu_noise_rate))):
         row = a.shape[0] - len(SOURCES) + k
         a[row, row] = -rate
-        b[row, k] = size * math.sqrt(2.0 * rate)
-    return Rail(network, load, rail, a, b, outputs[rail])
+        b[row, k] = rms * math.sqrt(2.0 * rate)
+    mean = bus if rail == 'bus' else (
+        network.regulator_voltage - network.regulator_resistance * network.mcu_current)
+    return Rail(network, rail, mean, network.battery_voltage - bus, a, b, outputs[rail])
 
 
 def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return the matrix `a`, with zeros for the noise sources, and the row `c` of each rail."""
+    # g: incremental conductance P/V^2 of the regulator's input, 1/Ohm.
     names = ['bulk', 'line', 'output', *SOURCES]
     unit = dict(zip(names, np.eye(len(names))))
     rate = {name: np.zeros(len(names)) for name in names}

@@ -6,8 +6,7 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
-from ou_monitor.paper.network import (
-    load_at, PowerNetwork, rail_at, UNITS)
+from ou_monitor.paper.network import PowerNetwork, rail_at, UNITS
 import pytest
 from scipy.integrate import quad
 from scipy.linalg import expm
@@ -32,11 +31,16 @@ def density(rail, f):
     return float(2.0 * np.sum(np.abs(gains(f, rail.a, rail.b, rail.c)) ** 2))
 
 
+def switching(rail):
+    """Return rate, 1/s, and variance, A^2, of the ESC current."""
+    return -rail.a[-3, -3], rail.b[-3, 0] ** 2 / (-2.0 * rail.a[-3, -3])
+
+
 def test_rc_has_the_textbook_pole_and_variance():
     """Var = v R^2 a / (a + lambda) for a current of variance v that relaxes at lambda."""
     rail = rail_at(RC, 0.4)
     a = 1.0 / (0.04 * 470e-6)
-    rate, variance = rail.load.switching_rate, rail.load.switching_rms**2
+    rate, variance = switching(rail)
     assert rail.alpha == pytest.approx(a, rel=1e-12)
     assert rail.var_inf == pytest.approx(variance * 0.04**2 * a / (a + rate), rel=1e-10)
     assert rail.mean == pytest.approx(22.2 - 0.04 * 120.0 * 0.4**1.5, rel=1e-14)
@@ -47,7 +51,7 @@ def test_esr_moves_the_pole_and_leaves_a_floor():
     network = replace(RC, bulk_esr=0.03)
     rail = rail_at(network, 0.4)
     a, both = 1.0 / (0.07 * 470e-6), 0.04 * 0.03 / 0.07
-    rate, variance = rail.load.switching_rate, rail.load.switching_rms**2
+    rate, variance = switching(rail)
     assert rail.alpha == pytest.approx(a, rel=1e-12)
     assert impedance(rail, 0.0).real == pytest.approx(0.04, rel=1e-12)
     assert np.abs(impedance(rail, [1e8, 1e9])) == pytest.approx(both, rel=1e-6)
@@ -88,7 +92,7 @@ def test_the_regulated_rail_in_its_own_noise():
 def test_without_a_regulator_the_source_feeds_the_load_alone():
     network = PowerNetwork(cells=0, battery_voltage=5.0, current_max=10.0, regulator_voltage=0.0)
     rail = rail_at(network, 0.4)
-    assert rail.load.sag == pytest.approx(0.04 * network.current_at(0.4), rel=1e-12)
+    assert rail.sag == pytest.approx(0.04 * network.current_at(0.4), rel=1e-12)
     assert rail.alpha == pytest.approx(1.0 / ((0.04 + 0.03) * 470e-6), rel=1e-10)
     assert impedance(rail, 0.0).real == pytest.approx(0.04, rel=1e-12)
     with pytest.raises(ValueError, match='no regulated rail'):
@@ -119,11 +123,11 @@ def test_variance_is_the_integral_of_the_density(network, rail):
 
 def test_ripple_is_largest_at_two_thirds_and_independent_escs_add_in_power():
     throttles = np.linspace(0.0, 1.0, 301)
-    rms = [load_at(PowerNetwork(), float(u)).switching_rms for u in throttles]
+    rms = [math.sqrt(switching(rail_at(PowerNetwork(), float(u)))[1]) for u in throttles]
     assert throttles[np.argmax(rms)] == pytest.approx(2.0 / 3.0, abs=0.004)
     assert rms[0] == rms[-1] == 0.0
-    one = load_at(PowerNetwork(escs=1), 0.4).switching_rms
-    assert load_at(PowerNetwork(escs=4), 0.4).switching_rms == pytest.approx(one / 2.0)
+    one, four = (switching(rail_at(PowerNetwork(escs=n), 0.4))[1] for n in (1, 4))
+    assert four == pytest.approx(one / 4.0)
 
 
 def test_without_noise_the_rate_is_nan():
