@@ -35,6 +35,7 @@ from ou_monitor.online.settings import DEFAULT_LIMIT, RAIL
 from ou_monitor.paper.network import completed, PowerNetwork, Rail, rail_at
 from ou_monitor.records import FloatArray
 from ou_monitor.text import number, percent
+from scipy.integrate import quad_vec
 from scipy.special import ndtr
 
 CELL_BROWNOUT = 3.3  # Brown-out level of a LiPo cell, V
@@ -48,11 +49,8 @@ _GRID = 81
 # Limits of the alternatives to capacitors: maximum packs in parallel, minimum share of the present
 # resistance (new leads and a fresh pack), and of the present throttle.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
-# Quadrature over the error of a mean: range, standard errors; Gauss-Legendre nodes and weights.
+# Range of the error of a mean, standard errors.
 _FAR = 8.0
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
-
-
 # Throttle, and factors on the sag and on the variance of the noise -> risk of a flight.
 FlownRisk = Callable[[float, float, float], float]
 
@@ -170,13 +168,11 @@ def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -
     se = sag_error * rail.sag if rail.name == 'bus' else 0.0
     if se > 0.0:
         # Where the uncertain mean is below the voltage, the risk is 1; integrate over the rest.
-        lowest = max((voltage - rail.mean) / se, -_FAR)
-        risks = np.full(2, float(ndtr((voltage - rail.mean) / se)))
-        z = lowest + 0.5 * (_FAR - lowest) * (_NODES + 1.0)
-        weight = 0.5 * (_FAR - lowest) * _WEIGHTS * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-        for share, off in zip(weight.tolist() if lowest < _FAR else (), (se * z).tolist()):
-            risks -= share * np.expm1(-horizon * _rates(rail, voltage - off))
-        rates = _rate_of(risks, horizon)
+        level = (voltage - rail.mean) / se
+        risks, _ = quad_vec(
+            lambda z: -np.expm1(-horizon * _rates(rail, voltage - se * z)) * math.exp(
+                -0.5 * z * z) / math.sqrt(2.0 * math.pi), min(max(level, -_FAR), _FAR), _FAR)
+        rates = _rate_of(ndtr(level) + risks, horizon)
     net = rail.network
     slow, crossing = rates.tolist()
     risk_ou, risk_crossing = (-np.expm1(-horizon * rates)).tolist()

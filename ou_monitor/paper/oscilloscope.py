@@ -110,12 +110,6 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     return found
 
 
-def screen_for(crest_factor: float) -> float:
-    """Return the screen length at which an OU shows a crest factor, s."""
-    # At this length, half of the screens exceed crest/2 standard deviations on one side.
-    return math.log(2.0) * mean_first_passage(0.0, 0.5 * crest_factor) / published.ALPHA.value
-
-
 def crest_rows(crests: Crests) -> list[Row]:
     """Return one row for each load state with a Vrms."""
     mean, error = crests.mean(TYPICAL_MS)
@@ -123,8 +117,10 @@ def crest_rows(crests: Crests) -> list[Row]:
     found = []
     for state in published.LOADED:
         value, inputs = state.crest, state.crest_range
+        # At this length, half of the screens exceed crest/2 standard deviations on one side.
+        screen = math.log(2.0) / published.ALPHA.value * mean_first_passage(0.0, 0.5 * inputs[0])
         beyond = ('' if inputs[0] <= crests.band[1] else
-                  f'; even {inputs[0]:.1f} would need a screen of {screen_for(inputs[0]):.2g} s')
+                  f'; even {inputs[0]:.1f} would need a screen of {screen:.2g} s')
         found.append(Row(
             'Table 1', f'Vpp/Vrms, {state.label}', '', Printed(f'{value:.1f}'), mean,
             f'OU with tau {published.TAU_MS.text} ms sampled at 1 MHz, {count} segments of '
@@ -193,11 +189,6 @@ def largest(found: list[JumpCrest], screen: int) -> JumpCrest:
     return max((c for c in found if c.screen == screen), key=lambda c: c.mean)
 
 
-def impulse_height(state: published.PrintedLoad, crests: Crests) -> float:
-    """Return the height of short impulses that would raise an OU to the printed Vpp, mV."""
-    return state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
-
-
 def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     """Return the rows of section 5 on jumps."""
     low, high = published.LOW.crest, published.HIGH.crest
@@ -210,6 +201,8 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
     for state in (published.LOW, published.MEDIUM):
         value, inputs = state.crest, state.crest_range
+        # Impulses of this height, mV, would raise the OU to the printed Vpp.
+        height = state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
         for ms in JUMP_SCREENS_MS:
             best = largest(found, ms)
             result.append(Row(
@@ -220,7 +213,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
                 f'Largest mean: {best.mean:.1f} ({best.band[0]:.1f} to {best.band[1]:.1f}), '
                 f'with {best.rate:g} jumps a second of {best.size(state.vrms.value):.0f} mV rms, '
                 f'{100 * best.share:.0f} % of the variance; impulses too short to count in Vrms '
-                f"would have to add {impulse_height(state, crests):.0f} mV to the OU's Vpp.",
+                f"would have to add {height:.0f} mV to the OU's Vpp.",
                 error=best.error, band=best.band, printed_inputs=inputs, point=8))
     return result
 

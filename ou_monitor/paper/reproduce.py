@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 import math
 from typing import Any
 
@@ -123,12 +124,9 @@ class Reproduction:
 
     def parts(self) -> list[tuple[str, list[Row]]]:
         """Return the rows by table, figure and main section of the paper."""
-        found: dict[str, list[Row]] = {}
-        for row in self.rows:
-            # 'Section 4.5' belongs to 'Section 4'; 'Fig. 5' stays.
-            found.setdefault(row.where.rsplit('.', 1)[0] if row.where.startswith('Section')
-                             else row.where, []).append(row)
-        return list(found.items())
+        # 'Section 4.5' belongs to 'Section 4'; 'Fig. 5' stays.
+        return [(part, list(rows)) for part, rows in groupby(self.rows, lambda row: (
+            row.where.partition('.')[0] if row.where.startswith('Section') else row.where))]
 
 
 def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:

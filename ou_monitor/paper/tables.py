@@ -109,14 +109,6 @@ def exponent(low: PrintedLoad, high: PrintedLoad) -> tuple[float, Range]:
             (math.log(ends[0]) / span, math.log(ends[1]) / span))
 
 
-def sigma_half_width(state: PrintedLoad) -> float:
-    """Return the uncertainty of sigma, V/sqrt(s)."""
-    # Half a step of Vrms and half of the 95 % interval of alpha, in quadrature.
-    reading = 0.5 * VRMS_STEP.size / state.vrms.value
-    rate = 0.5 * PAPER_FIT.half_width / PAPER_FIT.alpha
-    return state.sigma * math.hypot(reading, rate)
-
-
 def table_2() -> list[Row]:
     """Return the rows of Table 2 and of the sections that repeat it."""
     alpha = ALPHA.value
@@ -136,7 +128,9 @@ def _load_rows(state: PrintedLoad) -> list[Row]:
     half = 1e-3 * state.vrms.half_unit * math.sqrt(2.0 * ALPHA.value)
     step = VRMS_STEP
     whole = 1e-3 * round(state.vrms.value / step.size) * step.low * ROOT_2_ALPHA.value
-    width = sigma_half_width(state)
+    # Half a step of Vrms and half of the 95 % interval of alpha, in quadrature.
+    width = sigma * math.hypot(0.5 * step.size / state.vrms.value,
+                               0.5 * PAPER_FIT.half_width / PAPER_FIT.alpha)
     low, high = state.vrms_range
     var = stationary_variance(ALPHA.value, printed.value)
     return [
@@ -230,10 +224,6 @@ def doubled(network: PowerNetwork) -> tuple[Rail, Rail]:
     return rail_at(network, HIGH.load), rail_at(more, HIGH.load)
 
 
-def _elasticity(before: float, after: float) -> float:
-    return math.log(after / before) / math.log(2.0)
-
-
 def share_above(frequency: float) -> float:
     """Return the share of an OU's variance above a frequency, Hz, for the paper's alpha."""
     return 1.0 - 2.0 / math.pi * math.atan(2.0 * math.pi * frequency / ALPHA.value)
@@ -260,9 +250,10 @@ def _hardware() -> list[Row]:
 def _capacitance() -> list[Row]:
     one, two = (rc_rail(_R, k * _C, _S) for k in (1.0, 2.0))
     before, after = doubled(PowerNetwork())
-    alpha, var = (_elasticity(a, b) for a, b in zip(one, two))
-    net_alpha, net_var = (_elasticity(before.alpha, after.alpha),
-                          _elasticity(before.var_inf, after.var_inf))
+    # With C doubled, the logarithm to base 2 of a quotient is its elasticity.
+    alpha, var = (math.log2(b / a) for a, b in zip(one, two))
+    net_alpha, net_var = (math.log2(after.alpha / before.alpha),
+                          math.log2(after.var_inf / before.var_inf))
     loop = before.network.battery_resistance + before.network.bulk_esr
     farad = 1.0 / (ALPHA.value * loop)
     return [
@@ -346,16 +337,6 @@ def multiplicative() -> SwitchedSystem:
                           np.array([[[GROWTH]], [[-GROWTH]]]))
 
 
-def variance_rate(system: SwitchedSystem, rng: np.random.Generator,
-                  paths: int) -> tuple[float, float]:
-    """Return the long-run growth rate of the variance of a balanced additive system."""
-    # (Var U(T) - Var U(S)) / (T - S), unbiased if S is longer than the memory of the chain.
-    memory = 1.0 / float(system.generator.leaving.min())
-    t = memory * np.array([0.0, 10.0, 110.0])
-    u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]
-    return mean_and_error((u[:, 2] ** 2 - u[:, 1] ** 2) / (t[2] - t[1]))
-
-
 def spreading(rng: np.random.Generator, paths: int) -> IntegralVariance:
     """Return the variance of the integral of telegraph noise over time."""
     system = telegraph()
@@ -388,7 +369,10 @@ def _intensity(rng: np.random.Generator, paths: int) -> list[Row]:
             ('telegraph', f'+-{SPEED:g} V/s, {RATE:g} 1/s each way', telegraph()),
             ('three states', 'a chain that is not reversible', three_states())):
         printed = float(switching_intensity(system, [0.0], PRINTED_FACTOR)[0, 0])
-        rate, error = variance_rate(system, rng, paths)
+        # (Var U(T) - Var U(S)) / (T - S), unbiased if S is longer than the memory of the chain.
+        t = np.array([0.0, 10.0, 110.0]) / float(system.generator.leaving.min())
+        u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]
+        rate, error = mean_and_error((u[:, 2] ** 2 - u[:, 1] ** 2) / (t[2] - t[1]))
         found.append(Row(
             WHERE, f'B of (6), {name}', 'mV^2/s', Printed(f'{1e6 * printed:.4g}'), 1e6 * rate,
             f'long-run variance rate of the switching system ({what}), {paths} paths',

@@ -417,5 +417,4 @@ def test_jumps_raise_the_crest_factor_of_long_screens(crests):
     rows = oscilloscope.jump_rows(found, crests)
     assert len(rows) == 5
     assert rows[0].recomputed == pytest.approx((287.5 / 56.3) / (81.3 / 9.38))
-    assert oscilloscope.impulse_height(published.LOW, crests) == pytest.approx(
-        81.3 - 9.38 * crests.mean(100)[0])
+    assert f' {81.3 - 9.38 * crests.mean(100)[0]:.0f} mV to the OU' in rows[1].sentence
