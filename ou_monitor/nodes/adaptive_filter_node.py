@@ -26,7 +26,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import (
-    Console, decode, INPUT_QOS, NO_CLOCK, Silence, SourceFinder, Stamper, types_on, within)
+    Console, decode, INPUT_QOS, NO_CLOCK, Silence, SourceFinder, Stamper, types_on)
 from ou_monitor.nodes.sources import AUTO, message_class, MOTOR_PARAMETERS, Source
 from ou_monitor.online.filter.cutoff import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
@@ -97,7 +97,7 @@ class SupplyInput:
         # If sigma is unknown, take the sigma of an OU with relaxation `rate`, 1/s, and the rms of
         # the load model's noise at the present throttle.  This sigma includes the white noise of
         # the ADC, so it is not below the supply's own sigma.
-        fresh = within(self.state_silence.age, stale_after)
+        fresh = self.state_silence.age <= stale_after
         error, alpha, throttle, noise = self._values if fresh else _UNKNOWN
         why = self._why_no_sigma(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
@@ -108,9 +108,9 @@ class SupplyInput:
 
     def _why_no_sigma(self, fresh: bool, stale_after: float) -> str:
         age = self.sigma_silence.age
-        if age is None:
+        if age == math.inf:
             return f'no message on {self._topic}'
-        if not within(age, stale_after):
+        if age > stale_after:
             return f'sigma on {self._topic} is stale, {age:.1f} s old'
         if math.isnan(self._sigma):
             return f'sigma on {self._topic} is not a number, or negative'
@@ -144,7 +144,7 @@ class MotorInputs:
 
     def throttle(self, stale_after: float) -> float:
         """Return the throttle, 0..1; NaN if the newest is older than `stale_after`, s."""
-        return self._throttle if within(self.silence['throttle'].age, stale_after) else NAN
+        return self._throttle if self.silence['throttle'].age <= stale_after else NAN
 
     def take_speeds(self) -> list[float]:
         """Return the motor speeds received since the last call; empty if there are none."""
@@ -232,7 +232,7 @@ class AdaptiveFilterNode(MonitorNode):
             known = [kind for kind in self._found if self._field or kind in CHANNELS]
             if known:
                 self._open(known[0])
-        if self._input_silence.age is None and (self._channels is not None or not self._found):
+        if self._input_silence.age == math.inf and (self._channels is not None or not self._found):
             self._console.waiting(self._topic)
 
     def _open(self, kind: str) -> None:
@@ -355,16 +355,15 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _judge(self, supply: SupplyEstimate) -> tuple[Level, str]:
         s = self.low_pass.settings
-        age = self._input_silence.age
         if self._channels is None and self._found:
             return Level.WARN, (
                 f"Cannot filter {self._topic} of type {', '.join(self._found)}: name its signal "
                 f"with input.field; only {', '.join(CHANNELS)} need no name.")
         if self._channels is None:
             return Level.STALE, f'Waiting for a publisher on {self._topic}.'
-        if age is None or age > max(s.stale_after, SLOW_MISSED * self._input_interval.value):
-            return Level.STALE, f'No message on {self._topic}' + (
-                ' yet.' if age is None else f' for {age:.1f} s.')
+        if self._input_silence.age > max(s.stale_after, SLOW_MISSED * self._input_interval.value):
+            return Level.STALE, (
+                f"No message on {self._topic}{self._input_silence.words or ' yet'}.")
         if self._stamper.waiting and self._unplaced:
             return Level.WARN, NO_CLOCK
         if self._input_clock.stamps is not StampOrder.GOOD:

@@ -115,12 +115,11 @@ class AdcNode(MonitorNode):
             due = max(due + 1.0 / self.rate, time.monotonic())
 
     def _diagnose(self) -> None:
-        age = self._silence.age
         holes = 0 if self._buffer is None else self._buffer.holes
         level, summary = Level.OK, f'{self._channel} of {self._device} is read.'
         if self.problem:
             level, summary = Level.ERROR, f'{self._device} is no longer read: {self.problem}'
-        elif age is None or age > max(SILENT, 3.0 / self.rate if self.rate > 0.0 else 0.0):
+        elif self._silence.age > max(SILENT, 3.0 / self.rate if self.rate > 0.0 else 0.0):
             level, summary = Level.STALE, (
                 f'No samples of {self._channel} from {self._device}{self._silence.words}: '
                 'is its trigger running?')

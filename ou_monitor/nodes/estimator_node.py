@@ -26,8 +26,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE, SWITCH
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.inputs import (
-    Arrivals, Console, NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, Stamper,
-    within)
+    Arrivals, Console, NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, Stamper)
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
@@ -155,7 +154,7 @@ class EstimatorNode(MonitorNode):
     def _watch(self) -> None:
         self._stamper.follow()
         self._watched.look(self._inputs.get('voltage'))
-        if self._arrived.age is None and not self._sources.problems['voltage']:
+        if self._arrived.age == math.inf and not self._sources.problems['voltage']:
             self._console.waiting(self._voltage.topic)
         self._sources.watch()
         self._watch_throttle()
@@ -255,8 +254,7 @@ class EstimatorNode(MonitorNode):
     def _watch_throttle(self) -> None:
         # A slow source may miss three messages.
         limit = 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
-        age = self._throttle_silence.age
-        if age is not None and age > limit and not math.isnan(self._stream.throttle):
+        if self._throttle_silence.age > limit and not math.isnan(self._stream.throttle):
             self._stream.lose_throttle()
 
     def _jumped(self, reason: str) -> None:
@@ -326,8 +324,8 @@ class EstimatorNode(MonitorNode):
             level, summary = (Level.ERROR if silent else Level.WARN), problem
         elif 'voltage' not in self._inputs:
             summary = f'Waiting for a publisher on {self._topic}.'
-        elif silent and within(self._arrived.age, limit) and not within(
-                self._usable.age, max(report.patience, self._arrived.age or 0.0)):
+        elif silent and self._arrived.age <= limit and (
+                self._usable.age > max(report.patience, self._arrived.age)):
             summary = self._why_unusable()
         elif silent and not self.count_publishers(self._topic):
             summary = f'No publisher on {self._topic}: {report.summary}'
@@ -389,17 +387,18 @@ class EstimatorNode(MonitorNode):
 
     def _message(self, part: str, report: MonitorReport, level: Level, summary: str,
                  stamp: float) -> DiagnosticArray:
-        throttle_age, arrived = (math.inf if silence.age is None else silence.age
-                                 for silence in (self._throttle_silence, self._arrived))
+        settings = self._monitor.settings
         fields = {**report.fields,
+                  'brownout_voltage': settings.brownout_voltage,
+                  'brownout_horizon': settings.brownout_horizon,
                   'msg_config': self._voltage.config,
                   'messages': self._stream.messages,
                   'smoothed_rate': self._send_clock.rate if self._send_clock else math.nan,
-                  'throttle_age': throttle_age,
+                  'throttle_age': self._throttle_silence.age,
                   'throttle_problem': self._sources.problems.get('throttle', ''),
                   'model_terms': self._models.terms,
                   'clock': self._source_clock.name,
-                  'arrival_age': arrived,
+                  'arrival_age': self._arrived.age,
                   **self._watched.fields(),
                   'callback_errors': self.faults}
         return self.status(part, level, summary, fields, stamp, self._topic)

@@ -75,8 +75,8 @@ class Stamper:
     @property
     def waiting(self) -> bool:
         """Whether messages without a stamp cannot be placed in time yet."""
-        age = self._clock_silence.age
-        return self.simulated and (age is None or not self._map.ready or age > self._map.patience)
+        return self.simulated and (
+            not self._map.ready or self._clock_silence.age > self._map.patience)
 
     def follow(self) -> None:
         """Follow `use_sim_time`, which may change at run time."""
@@ -224,19 +224,14 @@ class Silence:
         self._last = now
 
     @property
-    def age(self) -> float | None:
-        """Seconds since the last arrival; None before the first arrival."""
-        return None if self._last == -math.inf else self._now() - self._last
+    def age(self) -> float:
+        """Seconds since the last arrival; infinity before the first arrival."""
+        return self._now() - self._last
 
     @property
     def words(self) -> str:
         """Return ' for 3.2 s'; empty before the first arrival."""
-        return '' if self.age is None else f' for {self.age:.1f} s'
-
-
-def within(age: float | None, limit: float) -> bool:
-    """Return whether something arrived within the limit, s."""
-    return age is not None and age <= limit
+        return f' for {self.age:.1f} s' if math.isfinite(self.age) else ''
 
 
 class SourceFinder:

@@ -19,18 +19,15 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS, types_on
 from ou_monitor.nodes.sources import message_class
-from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
 # Period of the rows, s, and number of rows kept.
 PERIOD, KEPT = 0.2, 300
-# Period of checking the graph and the parameters, s.
+# Period of checking the graph, s.
 _LOOK = 1.0
 # Age above which a state is no longer shown, s.
 _STALE = 2.0
-# Parameters of the estimator shown on the page.
-_SHOWN = ('brownout.voltage', 'brownout.horizon')
 # Fields of the state shown as numbers, and as words.
 _NUMBERS = ('voltage', 'throttle', 'sigma', 'noise_std', 'brownout_risk', 'throttle_budget', 'age')
 _WORDS = ('brownout', 'brownout_level', 'risk_basis', 'status')
@@ -51,7 +48,6 @@ class LiveNode(Node):
         self._level, self._summary, self._state_arrival = 0, '', -math.inf
         # Cutoff, Hz, and lag, ms, of the filter.
         self._newest = {'cutoff': math.nan, 'lag': math.nan}
-        self._limits: dict[str, float] = {}
         self._signals: dict[str, list[float]] = {'raw': [], 'filtered': []}
         self._open: dict[str, str] = {}
         self._estimator, self._filter = estimator, low_pass
@@ -59,8 +55,6 @@ class LiveNode(Node):
         for name in self._newest:
             self.create_subscription(
                 Float64, f'{low_pass}/{name}', partial(self._take_number, name), 10)
-        self._client = self.create_client(GetParameters, f'{estimator}/get_parameters')
-        self._answer: Any = None
         self.create_timer(PERIOD, self._add_row)
         self.create_timer(_LOOK, self._find_signals)
 
@@ -81,13 +75,7 @@ class LiveNode(Node):
         self._newest[name] = message.data
 
     def _find_signals(self) -> None:
-        """Subscribe to the filter's signals once they exist, and request the estimator's limit."""
-        if self._answer is not None and self._answer.done():
-            values = self._answer.result().values
-            self._limits = {name: value.double_value for name, value in zip(_SHOWN, values)}
-            self._answer = None
-        if self._answer is None and self._client.service_is_ready():
-            self._answer = self._client.call_async(GetParameters.Request(names=list(_SHOWN)))
+        """Subscribe to the filter's signals once they exist."""
         self._listen('filtered', f'{self._filter}/output')
         source = self._input()
         if source:
@@ -128,7 +116,8 @@ class LiveNode(Node):
         silent = now - self._state_arrival
         row: dict[str, Any] = {
             't': now - self._begin, 'silent': None if math.isinf(silent) else silent,
-            'limit': self._limits.get(_SHOWN[0]), 'horizon': self._limits.get(_SHOWN[1])}
+            'limit': known(self._state.get('brownout_voltage')),
+            'horizon': known(self._state.get('brownout_horizon'))}
         if silent < _STALE:
             row.update({name: known(self._state.get(name)) for name in _NUMBERS})
             row.update({name: self._state.get(name, '') for name in _WORDS})

@@ -20,7 +20,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import battery, MonitorNode, NAP
 from ou_monitor.nodes.inputs import (
-    NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, within)
+    NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder)
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.settings import Parameter
 from ou_monitor.recordings.model_file import read_model
@@ -210,7 +210,7 @@ class SupplySimulatorNode(MonitorNode):
             if good.size:
                 self._throttle = min(max(float(found.column.values[good[-1]]), 0.0), 1.0)
                 self._throttle_silence.record()
-        if not within(self._throttle_silence.age, _HOLD):
+        if self._throttle_silence.age > _HOLD:
             self._throttle = 0.0
         return self._throttle
 
@@ -281,7 +281,7 @@ class SupplySimulatorNode(MonitorNode):
         topic = '' if self._throttle_source is None else self.resolve_topic_name(
             self._throttle_source.topic)
         voltage = self.resolve_topic_name(self._voltage.source.topic)
-        idle = not within(self._throttle_silence.age, _HOLD)
+        idle = self._throttle_silence.age > _HOLD
         if self._played is None and self._needs_throttle and idle:
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
                          f'{self._throttle_silence.words}: the craft idles.')
