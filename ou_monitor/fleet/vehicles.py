@@ -8,7 +8,7 @@ ordered by date; the date comes from the stamps, the log's header or the file's 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -25,6 +25,11 @@ METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
 _DATE = re.compile(r'(?<!\d)(20\d\d)(?:([-_.])(\d\d?)\2(\d\d?)|(\d\d)(\d\d))(?:[T _-]+(\d\d)'
                    r'[-_:.h]?(\d\d)(?:[-_:.m]?(\d\d))?)?(?!\d)')
 _SHOWN = 3  # Maximum paths or vehicles named in a note
+# Notes on paths.
+_DIFFERING = 'metadata and --vehicle-from name different vehicles; the metadata are used.'
+_UNMATCHED = '--vehicle-from finds no vehicle in the path; these recordings are not compared.'
+_MIXED = ('the metadata lack the vehicle, which other recordings in the folder state; these '
+          'recordings are not compared. --vehicle-from can take the vehicle from the path.')
 
 
 @dataclass(frozen=True)
@@ -48,33 +53,25 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
            ) -> tuple[dict[Path, Vehicle], list[str]]:
     """Return the vehicle of each recording (stated: by its metadata), and notes."""
     found: dict[Path, Vehicle] = {}
-    differing, unmatched = [], []
     folders = _folder_names({path.parent for path, name in stated.items() if not name})
     named = {path.parent for path, name in stated.items() if name}
-    mixed = []
+    odd: dict[str, list[Path]] = {}
     for path, name in stated.items():
-        by_pattern = _match(pattern, path)
+        by_pattern, why = _match(pattern, path), ''
         if name:
             found[path] = Vehicle(name, METADATA)
-            if by_pattern and by_pattern != name:
-                differing.append(path)
+            why = _DIFFERING if by_pattern not in ('', name) else ''
         elif pattern is not None:
             found[path] = Vehicle(by_pattern, PATTERN)
-            if not by_pattern:
-                unmatched.append(path)
-        elif path.parent in named:
-            # Other recordings in the folder name their vehicles, so the folder is not a vehicle.
-            found[path] = Vehicle('', FOLDER)
-            mixed.append(path)
+            why = '' if by_pattern else _UNMATCHED
         else:
-            found[path] = Vehicle(folders[path.parent], FOLDER)
-    notes = [_rule_counts(found), *(f'{_quoted(paths)}: {words}' for paths, words in (
-        (differing, 'metadata and --vehicle-from name different vehicles; the metadata are used.'),
-        (unmatched, '--vehicle-from finds no vehicle in the path; these recordings are not '
-         'compared.'),
-        (mixed, 'the metadata lack the vehicle, which other recordings in the folder state; these '
-         'recordings are not compared. --vehicle-from can take the vehicle from the path.')
-    ) if paths)]
+            # If other recordings in the folder name their vehicles, the folder is not a vehicle.
+            why = _MIXED if path.parent in named else ''
+            found[path] = Vehicle('' if why else folders[path.parent], FOLDER)
+        if why:
+            odd.setdefault(why, []).append(path)
+    notes = [_rule_counts(found), *(
+        some((f"'{path}'" for path in paths), _SHOWN) + f': {why}' for why, paths in odd.items())]
     both = {v.name for v in found.values() if v.named_by == METADATA} & {
         v.name for v in found.values() if v.named_by != METADATA and v.name}
     if both:
@@ -118,10 +115,6 @@ def _rule_counts(found: Mapping[Path, Vehicle]) -> str:
     return 'Vehicles: ' + ('; '.join(parts) if parts else 'none identified') + '.'
 
 
-def _quoted(paths: Sequence[Path]) -> str:
-    return some((f"'{path}'" for path in paths), _SHOWN)
-
-
 def start_of(recording: Recording) -> tuple[float, str]:
     """Return the time of the first sample, s since 1970 or NaN, and where it is from."""
     if clock_unit(float(recording.t[0])) == 's':
@@ -157,13 +150,9 @@ def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float
             by_name.append(name)
         order = sorted(paths, key=lambda path: (
             starts[path] if dated else 0.0, natural(str(path))))
-        for k, path in enumerate(order):
-            flights[path] = k + 1
-    notes = []
-    if by_name:
-        notes.append(f'{some(sorted(by_name), _SHOWN)}: some dates of flights are unknown or '
-                     'equal, so the order of names decides.')
-    return flights, notes
+        flights.update({path: number for number, path in enumerate(order, 1)})
+    return flights, [f'{some(sorted(by_name), _SHOWN)}: some dates of flights are unknown or '
+                     'equal, so the order of names decides.'] if by_name else []
 
 
 def natural(text: str) -> tuple[object, ...]:

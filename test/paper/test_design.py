@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.design import (
-    answer, default_voltage, design, DesignVerdict, effect, row_of, with_capacitance)
+    answer, design, DesignVerdict, effect, row_of, with_capacitance)
 from ou_monitor.paper.network import PowerNetwork, rail_at
 from ou_monitor.report.design_document import design_document
 from ou_monitor.report.terminal import terminal
@@ -46,13 +46,6 @@ def test_a_row_is_the_ou_of_the_rail():
     assert row.risk_crossing == pytest.approx(1.0 - math.exp(-5.0 * row.crossing_rate))
     assert row.risk == max(row.risk_ou, row.risk_crossing)
     assert row.rate == max(1.0 / row.mean_time, row.crossing_rate)
-
-
-def test_parallel_capacitors_keep_esr_times_capacitance():
-    network = PowerNetwork()
-    more = with_capacitance(network, 940e-6)
-    assert (more.bulk_capacitance, more.bulk_esr) == (940e-6, pytest.approx(0.015))
-    assert with_capacitance(network, 940e-6, esr_follows=False).bulk_esr == 0.03
 
 
 def test_a_capacitor_that_is_large_enough_is_said_so():
@@ -120,14 +113,6 @@ def test_without_throttle_there_is_no_noise():
     assert result.verdict is DesignVerdict.ENOUGH and result.present.risk == 0.0
     assert math.isinf(result.present.mean_time) and result.present.sigma == 0.0
     assert effect(result) == 'There is no noise at this throttle.'
-
-
-def test_default_levels_follow_cells_and_rail():
-    assert default_voltage(4, 5.0)[0] == 4 * 3.3
-    assert default_voltage(0, 5.023)[0] == 4.5
-    assert default_voltage(0, 3.3)[0] == 2.88
-    with pytest.raises(ValueError, match='a rail of 9 V'):
-        default_voltage(0, 9.0)
 
 
 @pytest.mark.parametrize('changed, words', [
