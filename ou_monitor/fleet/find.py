@@ -140,13 +140,9 @@ def _has_columns(path: Path) -> bool:
     """Return whether the first lines of a file have columns of time and voltage."""
     try:
         open_regular(path).close()
-    except OSError:
-        # Accept it by its name; the reader reports the error.
-        return True
-    try:
         return holds_supply(path)
     except Exception:
-        # A defect of this package; the row of the file in the table reports it.
+        # Accept it by its name; its row in the table reports the error, or a defect of the reader.
         return True
 
 
@@ -155,21 +151,16 @@ def _source(path: Path) -> FoundRecording:
     if os.path.isdir(path):
         with suppress(OSError):
             files = sorted(path.iterdir())
-    size, stamps = 0, []
-    for file in list(files):
-        try:
-            found = file.stat()
-        except OSError:
-            # Deleted, a broken link, or unreadable: the reader reports it.
-            files.remove(file)
-            continue
-        if not stat.S_ISREG(found.st_mode):
-            files.remove(file)
-            continue
-        size += 0 if file.name == FILE else found.st_size
-        stamps += [found.st_mtime_ns, found.st_size]
-    data = tuple(file for file in files if file.name != FILE)
-    return FoundRecording(path, data, size, tuple(stamps))
+    found: dict[Path, os.stat_result] = {}
+    for file in files:
+        # Deleted, a broken link, or unreadable: the reader reports it.
+        with suppress(OSError):
+            if stat.S_ISREG((status := file.stat()).st_mode):
+                found[file] = status
+    data = tuple(file for file in found if file.name != FILE)
+    return FoundRecording(
+        path, data, sum(found[file].st_size for file in data),
+        tuple(value for one in found.values() for value in (one.st_mtime_ns, one.st_size)))
 
 
 def duplicates(sources: Sequence[FoundRecording],

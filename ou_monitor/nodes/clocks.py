@@ -7,18 +7,17 @@ messages of a 1 kHz source leave within 0.2 ms, and a change over 1 ms seems to 
 0.5 % of the intervals are like this, sigma doubles.  The samples of a steady source are therefore
 put on an even time line that slowly follows the source timestamps.
 
-A message of a steady source can be late, but not early: the lower convex hull of source timestamp
-against message number is a straight line with the period as its slope, and many messages lie near
-it (Zhang, Liu & Xia 2002, "Clock synchronization algorithms for network measurements", separate
-clock skew from delays in this way).  At any sampling rate, the hull must span many pauses, because
-a burst of 400 messages sent 10 us apart is a straight line too.
+A message can be late, but not early: the lower convex hull of source timestamp against message
+number is a straight line with the period as its slope (Zhang, Liu & Xia 2002, "Clock
+synchronization algorithms for network measurements").  The hull must span many pauses, because a
+burst of 400 messages sent 10 us apart is a straight line too.
 
 Limits: a constant delay remains.  The times of an unsteady source are not changed; if its
 intervals cannot be sampling intervals, as when a driver empties a buffer, `in_bursts` is true.
 
-`SimClockMap`: the middleware stamps every message with the wall clock of its sender.  If a bag is
-replayed at four times its speed, these stamps are four times too close, and alpha would be four
-times too large.  Messages on `/clock` contain simulated time too, and so determine the map to it.
+`SimClockMap`: the middleware stamps every message with the wall clock of its sender, which a
+replay at four times the speed makes four times too close.  Messages on `/clock` contain simulated
+time too, and so determine the map to it.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from ou_monitor.paper.oscilloscope import (
     CORNER_HZ, crest_rows, Crests, decay_rows, jump_rows, simulate_crests, simulate_jumps,
     slowest_rail)
 from ou_monitor.paper.published import mean_and_error, Row, RowVerdict
-from ou_monitor.paper.tables import IntegralVariance
 from ou_monitor.records import FloatArray
 from ou_monitor.text import number
 from scipy.signal import welch
@@ -120,7 +119,6 @@ class Reproduction:
     rows: tuple[Row, ...]  # In the order of the paper
     points: tuple[Point, ...]  # The eight points
     crests: Crests  # Simulated crest factors
-    spreading: IntegralVariance  # Variance of the integral of telegraph noise
 
     def parts(self) -> list[tuple[str, list[Row]]]:
         """Return the rows by table, figure and main section of the paper."""
@@ -137,7 +135,7 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
         return lambda share: report(start + share * (stop - start))
 
     # Each part has its own generator, so that none depends on the draws of another.
-    rngs = np.random.default_rng(seed).spawn(7)
+    rngs = np.random.default_rng(seed).spawn(6)
     crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
     found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
     rows = [*tables.table_1(*mean_and_error(crests.white)), *crest_rows(crests),
@@ -149,10 +147,9 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     rows += tables.switching_rows(rngs[4])
     report(0.86)
     rows += tables.averaging_rows(rngs[5])
-    spreading = tables.spreading(rngs[6], 20_000)
     report(1.0)
     ordered = tuple(sorted(rows, key=lambda row: _ORDER.index(row.where)))
-    return Reproduction(seed, ordered, eight_points(ordered, crests), crests, spreading)
+    return Reproduction(seed, ordered, eight_points(ordered, crests), crests)
 
 
 def headline(result: Reproduction) -> str:

@@ -8,7 +8,6 @@ numbers use no limit theorem.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -22,7 +21,7 @@ from ou_monitor.paper.published import (
     Printed, PrintedLoad, Range, ReadingStep, RESTATED, ROOT_2_ALPHA, Row, SAMPLING_HZ, SIGMA,
     TABLE_1, TAU_MS, VAR_INF, VPP_STEP, VRMS_STEP)
 from ou_monitor.paper.theory import (
-    CORRECT_FACTOR, Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem, switching_drift,
+    Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem, switching_drift,
     switching_intensity)
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted, percent
@@ -304,19 +303,6 @@ DAMPING, COUPLING, CARRIER = 100.0, 40.0, 2.0 * math.pi * 10.0
 _SWING = np.array([1.3, 0.7])
 
 
-@dataclass(frozen=True, eq=False)
-class IntegralVariance:
-    """Variance of the integral of telegraph noise, from Monte Carlo."""
-
-    t: FloatArray  # Times, s; shape (k,)
-    # Variance and its standard error, V^2; shape (k,).
-    variance: FloatArray
-    error: FloatArray
-    # Rates by formula (6) with the factor of 2 and without, V^2/s.
-    correct: float
-    printed: float
-
-
 def telegraph() -> SwitchedSystem:
     """Return dU/dt = +-SPEED, switching at RATE each way."""
     return SwitchedSystem(Generator.telegraph(RATE, RATE), np.zeros((2, 1, 1)),
@@ -335,18 +321,6 @@ def multiplicative() -> SwitchedSystem:
     """Return dU/dt = +-GROWTH U, switching at RATE each way."""
     return SwitchedSystem(Generator.telegraph(RATE, RATE),
                           np.array([[[GROWTH]], [[-GROWTH]]]))
-
-
-def spreading(rng: np.random.Generator, paths: int) -> IntegralVariance:
-    """Return the variance of the integral of telegraph noise over time."""
-    system = telegraph()
-    t = np.linspace(0.0, 30.0 / RATE, 31)
-    u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]
-    variance = np.mean(u ** 2, axis=0)
-    error = np.std(u ** 2, axis=0) / math.sqrt(paths)
-    return IntegralVariance(t, variance, error, *(
-        float(switching_intensity(system, [0.0], factor)[0, 0])
-        for factor in (CORRECT_FACTOR, PRINTED_FACTOR)))
 
 
 def switching_rows(rng: np.random.Generator, paths: int = 20_000) -> list[Row]:

@@ -56,7 +56,7 @@ def _figures(result: Reproduction) -> list[Part]:
     # The eighth, after those of the rows.
     rng = np.random.default_rng(result.seed).spawn(8)[-1]
     return [Section('Figures, simulated from the numbers printed', [
-        *_screens(rng), *_transient(), *_spectrum(rng), *_crest_and_factor(result)])]
+        *_screens(rng), *_transient(), *_spectrum(rng), *_crests(result)])]
 
 
 def _screens(rng: np.random.Generator) -> list[Part]:
@@ -130,8 +130,8 @@ def _spectrum(rng: np.random.Generator) -> list[Part]:
         'coincide.'))]
 
 
-def _crest_and_factor(result: Reproduction) -> list[Part]:
-    crests = Plot('Vpp/Vrms of one OU', 'Vpp/Vrms', 'density', width=450, height=300)
+def _crests(result: Reproduction) -> list[Part]:
+    crests = Plot('Vpp/Vrms of one OU', 'Vpp/Vrms', 'density', height=300)
     edges = np.linspace(2.5, 10.0, 1 + _BINS)
     for k, (ms, values) in enumerate(sorted(result.crests.by_screen.items())):
         share, _ = np.histogram(values, edges, density=True)
@@ -139,17 +139,5 @@ def _crest_and_factor(result: Reproduction) -> list[Part]:
     crests.limits(x=(2.5, 10.0), y=(0.0, 1.15))
     for state in published.LOADED:
         crests.mark(state.crest, state.label)
-    s = result.spreading
-    t = 1e3 * s.t
-    factor = Plot('Variance under telegraph noise', 'time, ms', '10\u207b\u2076 V\u00b2',
-                  width=450, height=300)
-    factor.band(t, 1e6 * (s.variance - 3.0 * s.error), 1e6 * (s.variance + 3.0 * s.error),
-                'switching system, 3 standard errors', 0)
-    factor.line(t, 1e6 * s.variance, '', 0)
-    factor.line(t, 1e6 * s.printed * s.t, '(6) as printed', 1, 'thick')
-    factor.line(t, 1e6 * s.correct * s.t, '(6) with the factor of 2', 2, 'dash thick')
-    left = Figure(crests, 'Vertical lines: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
-    right = Figure(factor, (
-        'dU/dt = \u00b11 V/s, 1000 switches a second each way; the simulated variance lags behind '
-        '(6) by the memory of the chain.'))
-    return [Pair([left, right])]
+    return [Figure(
+        crests, 'Vertical lines: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')]

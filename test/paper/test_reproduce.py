@@ -367,14 +367,6 @@ def test_the_potential_of_a_telegraph_agrees(formulas):
     assert row.recomputed == pytest.approx(0.25) and row.verdict is RowVerdict.AGREES
 
 
-def test_spreading_follows_the_closed_form():
-    """Var = c^2/q (t - (1 - exp(-2 q t)) / (2 q)), at every time within 4.5 standard errors."""
-    found = tables.spreading(np.random.default_rng(13), PATHS)
-    exact = 1e-3 * (found.t + np.expm1(-2000.0 * found.t) / 2000.0)
-    assert (np.abs(found.variance - exact)[1:] < 4.5 * found.error[1:]).all()
-    assert (found.correct, found.printed) == pytest.approx((1e-3, 5e-4))
-
-
 def test_crest_factors_are_those_of_1_mhz(crests):
     """Against paths drawn sample by sample at 1 MHz, without bridges: mean and 95 % quantile."""
     # 10000 screens of 10 ms: the mean to 0.007. What 1 MHz leaves unseen is 0.04 there, ten times

@@ -70,7 +70,7 @@ def test_digits_follow_the_error(printed, value, error, text):
 
 
 def test_page_shows_every_row_and_figure(result, tree):
-    """One table row each, with its verdict; 9 drawings; headline and command."""
+    """One table row each, with its verdict; 8 drawings; headline and command."""
     text = ' '.join(tree.itertext())
     assert headline(result) in text and 'ou-monitor reproduce --seed 3' in text
     cells = [[''.join(cell.itertext()) for cell in line] for line in tree.iter('tr')]
@@ -79,7 +79,7 @@ def test_page_shows_every_row_and_figure(result, tree):
     shown = [(cell[2], cell[-1]) for cell in lines]
     parts = [row for _, rows in result.parts() for row in rows]
     assert shown == [(row.printed.text, row.verdict.value) for row in parts]
-    assert len(list(tree.iter('figure'))) == 9
+    assert len(list(tree.iter('figure'))) == 8
 
 
 @pytest.mark.parametrize('state', [published.MEDIUM, published.HIGH])
