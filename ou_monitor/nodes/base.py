@@ -80,7 +80,6 @@ class MonitorNode(Node):
         self.ending = Event()
         self._thread: Thread | None = None
         self._publishing: Timer | None = None
-        self._outputs_callback: Callable[[], None] | None = None
         self._polled: list[Subscription] = []
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._changeable = {parameter.name for parameter in self.RUN_TIME}
@@ -166,11 +165,11 @@ class MonitorNode(Node):
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Apply checked parameters without losing state."""
-        if self._publishing is not None and self._outputs_callback is not None and (
-                self._publishing.timer_period_ns != round(1e9 / values[PUBLISH_RATE.name])):
-            # A timer would apply a new period only at the end of the present one.
-            self.destroy_timer(self._publishing)
-            self.publish_every(self._outputs_callback)
+        timer = self._publishing
+        if timer and timer.timer_period_ns != (period := round(1e9 / values[PUBLISH_RATE.name])):
+            timer.timer_period_ns = period
+            # Otherwise it applies the new period only at the end of the present one.
+            timer.reset()
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Call back every `period` s of real time, so that silence of `/clock` is detected too."""
@@ -178,7 +177,6 @@ class MonitorNode(Node):
 
     def publish_every(self, callback: Callable[[], None]) -> None:
         """Call back at `publish_rate`, which may change."""
-        self._outputs_callback = callback
         self._publishing = self.every(1.0 / self.values()[PUBLISH_RATE.name], callback)
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
