@@ -12,7 +12,6 @@ decay at 2 pi times its corner, unless the rail is slower.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 import math
@@ -71,17 +70,13 @@ def crest_of(screens: FloatArray) -> FloatArray:
     return np.asarray(np.ptp(screens, axis=-1) / screens.std(axis=-1))
 
 
-def simulate_crests(rng: np.random.Generator, paths: int,
-                    progress: Callable[[float], None] = lambda share: None) -> Crests:
-    """Draw screens of an OU with the paper's alpha, sampled at 1 MHz (progress 0..1)."""
-    found: dict[int, list[FloatArray]] = {ms: [] for ms in SCREENS_MS}
-    for begin in range(0, paths, _AT_ONCE):
-        for ms, values in _draw(rng, min(_AT_ONCE, paths - begin)).items():
-            found[ms].append(values)
-        progress(min(1.0, (begin + _AT_ONCE) / paths))
+def simulate_crests(rng: np.random.Generator, paths: int) -> Crests:
+    """Draw screens of an OU with the paper's alpha, sampled at 1 MHz."""
+    drawn = [_draw(rng, min(_AT_ONCE, paths - begin)) for begin in range(0, paths, _AT_ONCE)]
     points = round(1e-3 * TYPICAL_MS * published.SAMPLING_HZ)
     white = [float(crest_of(rng.standard_normal(points))) for _ in range(_WHITE)]
-    return Crests({ms: np.concatenate(rows) for ms, rows in found.items()}, np.array(white))
+    return Crests({ms: np.concatenate([part[ms] for part in drawn]) for ms in SCREENS_MS},
+                  np.array(white))
 
 
 def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
@@ -158,16 +153,15 @@ class JumpCrest:
         return vrms * math.sqrt(2.0 * published.ALPHA.value * self.share / self.rate)
 
 
-def simulate_jumps(rng: np.random.Generator, seconds: float,
-                   progress: Callable[[float], None] = lambda share: None) -> list[JumpCrest]:
-    """Draw screens of OUs with jumps (seconds in s, progress 0..1)."""
+def simulate_jumps(rng: np.random.Generator, seconds: float) -> list[JumpCrest]:
+    """Draw screens of OUs with jumps (seconds in s)."""
     alpha = published.ALPHA.value
     longest = max(JUMP_SCREENS_MS)
     # One more screen, dropped later, lets the jumps become stationary.
     t = np.arange(round((seconds + 1e-3 * longest) * _SAMPLING)) / _SAMPLING
     begin = round(1e-3 * longest * _SAMPLING)
     found = []
-    for k, rate in enumerate(RATES):
+    for rate in RATES:
         plain = simulate(t, alpha, math.sqrt(2.0 * alpha), rng)[begin:]
         jumping = SupplyModel((
             OU(alpha, 0.0, 0.0), Jumps(rate, 0.0, math.sqrt(2.0 * alpha / rate)))
@@ -180,7 +174,6 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
                 # Screens are many tau long, so neighbours are almost independent.
                 found.append(JumpCrest(
                     ms, rate, share, *mean_and_error(values), (float(low), float(high))))
-        progress((k + 1) / len(RATES))
     return found
 
 

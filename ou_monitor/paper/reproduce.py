@@ -130,14 +130,12 @@ class Reproduction:
 def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     """Recompute the paper (progress 0..1)."""
     report: Progress = progress or (lambda share: None)
-
-    def within(start: float, stop: float) -> Progress:
-        return lambda share: report(start + share * (stop - start))
-
     # Each part has its own generator, so that none depends on the draws of another.
     rngs = np.random.default_rng(seed).spawn(6)
-    crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
-    found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
+    crests = simulate_crests(rngs[0], CREST_PATHS)
+    report(0.35)
+    found = simulate_jumps(rngs[1], JUMP_SECONDS)
+    report(0.6)
     rows = [*tables.table_1(*mean_and_error(crests.white)), *crest_rows(crests),
             *tables.table_2(), *tables.hardware_and_growth(), *jump_rows(found, crests)]
     rows += decay_rows(rngs[2])
