@@ -176,10 +176,9 @@ class AdaptiveFilterNode(MonitorNode):
 
     def start(self) -> None:
         self._channels: Channels | None = None
-        self._filters: list[AdaptiveLowPass] = []
         values = self.values()
-        # Used until the filters exist.
-        self._idle = AdaptiveLowPass(**_filter_options(values))
+        # One for each signal; until the signals are known, one.
+        self._filters = [AdaptiveLowPass(**_filter_options(values))]
         self._notch = AdaptiveNotch(**notch_options(values))
         self._motors = MotorInputs(self, values, self.steady_now)
         self._supply = SupplyInput(self.steady_now, self.resolve_topic_name('sigma'))
@@ -211,14 +210,14 @@ class AdaptiveFilterNode(MonitorNode):
 
     def apply(self, values: Mapping[str, Any]) -> None:
         super().apply(values)
-        for channel in (self._idle, *self._filters):
+        for channel in self._filters:
             channel.configure(**_filter_options(values))
         self._notch.configure(**notch_options(values))
 
     @property
     def low_pass(self) -> AdaptiveLowPass:
         """Filter of the first signal; all signals have the same cutoff."""
-        return self._filters[0] if self._filters else self._idle
+        return self._filters[0]
 
     # -- messages in
 
@@ -236,7 +235,7 @@ class AdaptiveFilterNode(MonitorNode):
             self._console.waiting(self._topic)
 
     def _open(self, kind: str) -> None:
-        channels = channels_of(kind, self._field, mode=self._idle.settings.mode)
+        channels = channels_of(kind, self._field, mode=self.low_pass.settings.mode)
         message = message_class(kind)
         self._type, self._channels = kind, channels
         self._filters = [AdaptiveLowPass(**_filter_options(self.values()))

@@ -9,15 +9,13 @@ ahead.
 from __future__ import annotations
 
 import argparse
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor, wait
 import gc
 import itertools
 import math
-from queue import Empty, Queue
 import sys
-import threading
 import time
 from typing import Any
 
@@ -82,51 +80,37 @@ class Prefetch:
     """Iterates over a source; a thread reads up to `ahead` batches ahead, and passes on errors."""
 
     def __init__(self, source: Iterable[Message], ahead: int = AHEAD, batch: int = BATCH) -> None:
-        self._batches: Queue[list[Message] | None] = Queue(ahead)
-        self._full, self._closed = threading.Event(), threading.Event()
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(
-            target=self._read, args=(iter(source), batch), name='prefetch', daemon=True)
         sys.setswitchinterval(SWITCH)
-        self._thread.start()
+        self._source, self._size = iter(source), batch
+        self._pool = ThreadPoolExecutor(1, 'prefetch')
+        self._batches = deque(self._pool.submit(self._read) for _ in range(ahead))
 
     def fill(self) -> None:
-        """Wait until the queue is full or the whole source has been read."""
-        self._full.wait()
+        """Wait until all batches ahead, or the whole source, have been read."""
+        wait(self._batches)
 
     def close(self) -> None:
         """End the thread."""
-        self._closed.set()
-        while self._thread.is_alive():
-            # The thread may be waiting for a free place in the queue.
-            with suppress(Empty):
-                self._batches.get(timeout=0.01)
-        self._thread.join()
+        self._pool.shutdown(cancel_futures=True)
 
-    def _read(self, source: Iterator[Message], size: int) -> None:
+    def _read(self) -> tuple[list[Message], BaseException | None]:
         batch: list[Message] = []
         try:
-            while not self._closed.is_set():
-                batch = []
-                # `extend` keeps the messages before an error.
-                batch.extend(itertools.islice(source, size))
-                if self._batches.full() or not batch:
-                    self._full.set()
-                if not batch:
-                    break
-                self._batches.put(batch)
+            # `extend` keeps the messages before an error.
+            batch.extend(itertools.islice(self._source, self._size))
         except BaseException as error:
-            self._error = error
-            self._batches.put(batch)
-        finally:
-            self._full.set()
-            self._batches.put(None)
+            return batch, error
+        return batch, None
 
     def __iter__(self) -> Iterator[Message]:
-        while (batch := self._batches.get()) is not None:
+        while True:
+            batch, error = self._batches.popleft().result()
+            self._batches.append(self._pool.submit(self._read))
             yield from batch
-        if self._error is not None:
-            raise self._error
+            if error is not None:
+                raise error
+            if not batch:
+                return
 
 
 class Player(Node):

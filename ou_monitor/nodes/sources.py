@@ -73,29 +73,28 @@ class Source:
 
     def open_many(self) -> tuple[Any, ManyExtractor]:
         """Return the message class and an extractor that reads several numbers of a message."""
-        message, spec = self._open()
+        message, spec = self._class()
         extractor = ManyExtractor(spec)
         extractor.extract(message())
         return message, extractor
 
     def open(self) -> tuple[Any, FieldSpec]:  # noqa: A003
         """Return the message class and the field of the quantity; InputError if unusable."""
-        message, spec = self._open()
+        message, spec = self._class()
         definitions = definition_of(message)
         value_path(spec, definitions)
         stamp_paths(spec, definitions)
         return message, spec
 
-    def _open(self) -> tuple[Any, FieldSpec]:
-        if self.spec is None:
-            raise InputError(f'the type of the {self.quantity} is not known yet')
+    def _class(self) -> tuple[Any, FieldSpec]:
+        assert self.spec is not None, 'choose a candidate first'
         return message_class(self.spec.type, self.install), self.spec
 
 
 def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
     """Return the source of a quantity by the parameters; None if the msg_config lacks it."""
     topic, kind, field = (str(values[f'{quantity}.{key}']) for key in ('topic', 'type', 'field'))
-    rate = float(values['adc.sample_rate']) if quantity == 'voltage' else 0.0
+    rate = float(values.get('adc.sample_rate', 0.0)) if quantity == 'voltage' else 0.0
     if values['msg_config'] == AUTO:
         offered = _generic(quantity)
     else:

@@ -120,7 +120,7 @@ class SupplySimulatorNode(MonitorNode):
     FIXED = (*_SOURCES, *FIXED_PARAMETERS)
 
     def start(self) -> None:
-        values = {**self.values(), 'adc.sample_rate': 0.0}
+        values = self.values()
         self._lock = threading.Lock()
         if not values['model_file']:
             raise InputError('model_file is needed: ou-monitor discover RECORDING --save-model '

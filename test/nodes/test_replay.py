@@ -268,7 +268,7 @@ def test_the_gap_between_passes_is_not_counted():
 
 
 def test_prefetch_is_bounded_and_fills():
-    """`fill` waits for `ahead` batches; the thread then waits too, and `close` ends it."""
+    """`fill` waits for `ahead` batches; one is read for each one used; `close` ends the thread."""
     taken = []
 
     def endless():
@@ -279,12 +279,12 @@ def test_prefetch_is_bounded_and_fills():
             k += 1
     source = Prefetch(endless(), 10, 3)
     source.fill()
-    assert len(taken) == 33
+    assert len(taken) == 30
     iterator = iter(source)
     assert [next(iterator) for _ in range(25)] == list(range(25))
     source.close()
-    assert 33 <= len(taken) <= 100
-    assert 'prefetch' not in [thread.name for thread in threading.enumerate()]
+    assert 30 <= len(taken) <= 57
+    assert not any(thread.name.startswith('prefetch') for thread in threading.enumerate())
 
 
 def test_prefetch_raises_where_the_source_did():
