@@ -9,10 +9,6 @@ Common throttle: the logarithms of sigma and alpha follow one curve over throttl
 moved along the curve to the median throttle, which adds an error; values without throttle are not
 moved.  Resistance and sag come from the `supply` facts, per cell where cells are known.
 
-Drift: a line through the logarithms against flight number.  Weights come from the errors and a
-normal scatter between flights (Paule and Mandel).  The scale of the t test is the scatter about
-the line, so an error common to all flights does not count.
-
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
 divided by sqrt(s^2 + se^2).  se is the standard error of the value, s the scatter between
 recordings (a median absolute deviation).  The bound is a quantile of the largest score in

@@ -261,7 +261,11 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
             flown: FlownRisk | None) -> tuple[Lever, ...]:
     network, throttle, target, least = found.network, found.throttle, found.target, found.least
 
-    def risk(changed: PowerNetwork, u: float = throttle) -> float:
+    def risk(u: float, share: float = 1.0) -> float:
+        # At a throttle, with a share of the resistance.
+        if flown is not None:
+            return flown(u, share, 1.0)
+        changed = replace(network, battery_resistance=share * network.battery_resistance)
         try:
             return row_of(rail_at(changed, u, found.rail), found.voltage, found.horizon,
                           found.sag_error).risk
@@ -270,14 +274,11 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
             return 1.0
 
     def resistance(share: float) -> float:
-        if flown is None:
-            return risk(replace(network, battery_resistance=share * network.battery_resistance))
         # Less resistance cannot raise the risk; with the error of the level it may seem to.
-        return min(flown(throttle, share, 1.0), found.present.risk)
+        return min(risk(throttle, share), found.present.risk)
 
     def limit(share: float) -> float:
-        return flown(share * throttle, 1.0, 1.0) if flown is not None else risk(
-            network, share * throttle)
+        return risk(share * throttle)
 
     bulk = network.bulk_capacitance
     unit, ohm = ('%', 100.0) if found.assumed else ('mOhm', 1e3 * network.battery_resistance)
