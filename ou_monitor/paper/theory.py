@@ -66,21 +66,6 @@ class AffineSystem:
     matrix: FloatArray  # A, 1/s; shape (d, d)
     offset: FloatArray  # a, unit of u per second; shape (d,)
 
-    def __post_init__(self) -> None:
-        """Check the shapes."""
-        matrix = np.asarray(self.matrix, dtype=np.float64)
-        offset = np.asarray(self.offset, dtype=np.float64)
-        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-            raise ValueError(f'matrix must have shape (d, d), got {matrix.shape}')
-        if offset.shape != matrix.shape[:1]:
-            raise ValueError(
-                f'offset must have shape ({matrix.shape[0]},) to fit the matrix, '
-                f'got {offset.shape}')
-        if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
-            raise ValueError('matrix and offset must be finite')
-        object.__setattr__(self, 'matrix', matrix)
-        object.__setattr__(self, 'offset', offset)
-
     @property
     def growth_rate(self) -> float:
         """Return the largest real part of an eigenvalue of A, 1/s; >= 0: no restoring force."""
