@@ -1,14 +1,18 @@
-"""Real estimators: silence, NaN, bursts, time that jumps back, parameters, types."""
+"""Real estimators: silence, NaN, bursts, times and clocks, parameters, types."""
 
 import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from live import Estimator, ou_path, values_of, wait_until
+from live import Estimator, ou_path, to_stamp, values_of, wait_until
+from made_bags import encode
 import numpy as np
+from ou_monitor.recordings.bag import BagWriter
+from ou_monitor.recordings.standard_types import FLOAT32
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float32, Float64, String
 
 OK, WARN, STALE = b'\x00', b'\x01', b'\x03'
 DT = 0.001
@@ -250,3 +254,66 @@ def test_bursts_are_reported(world):
     fields = values_of(states[-1].status[0])
     assert fields['alpha'] == fields['smoothed_rate'] == 'nan'
     assert process.stop() == 0
+
+
+# A bag in a loop, three times as fast, without header stamps: all time comes from /clock.
+T0 = 1_700_000_000_000_000_000
+PASS, FASTER = 4, 3
+TRUE_SIGMA = 0.3
+
+
+def test_a_loop_on_simulated_time_clears_the_window_once(world):
+    path = world.folder / 'plain.mcap'
+    with BagWriter(path) as bag:
+        topic = bag.add_topic('/voltage', 'std_msgs/msg/Float32')
+        for k, voltage in enumerate(ou_path(1000 * PASS, 0.001, seed=11, sigma=TRUE_SIGMA)):
+            bag.write(topic, T0 + k * 1_000_000, encode(FLOAT32, {'data': voltage}))
+    probe = world.probe()
+    states = probe.listen('/ou_estimator/state', DiagnosticArray)
+    estimator = world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')
+    wait_until(lambda: states)
+    replay = world.start('replay', path, '--loop', '--rate', FASTER, '--wait', '15')
+
+    def stamps():
+        found = [float(values_of(message.status[0])['t']) for message in states]
+        return [t for t in found if math.isfinite(t)]
+
+    def passes():
+        return sum(b < a for a, b in zip(stamps(), stamps()[1:]))
+    wait_until(lambda: passes() >= 3, what='three passes')
+    assert [replay.stop(), estimator.stop()] == [0, 0]
+    seen = [values_of(message.status[0]) for message in states]
+    assert passes() <= int(seen[-1]['resets']) <= 2 * (passes() + 1)
+    # The line through /clock may run on by some ticks where a pass ends.
+    assert T0 * 1e-9 - 0.1 < min(stamps()) and max(stamps()) < T0 * 1e-9 + PASS + 0.3
+    full = [float(f['sigma']) for f in seen if int(f['n']) > 1500 and f['status'] == 'OK']
+    # By source time alone sigma would come out sqrt(3) times as large.
+    assert sorted(full)[len(full) // 2] == pytest.approx(TRUE_SIGMA, rel=0.15)
+    rates = [float(f['rate']) for f in seen if int(f['n']) > 1500]
+    assert sorted(rates)[len(rates) // 2] == pytest.approx(1000.0, rel=0.05)
+
+
+def test_without_a_clock_it_says_so(world):
+    probe = world.probe()
+    states = probe.listen('/ou_estimator/state', DiagnosticArray)
+    output = probe.publisher('/voltage', Float32)
+    estimator = world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')
+
+    def said():
+        output.publish(Float32(data=5.0))
+        return states and 'no message arrives on /clock' in states[-1].status[0].message
+    wait_until(said, what='complaint')
+    assert states[-1].status[0].level == b'\x03'
+    # A clock that runs, and then stops.
+    ticks = probe.publisher('/clock', Clock)
+    begin = time.monotonic()
+
+    def heard():
+        now = time.monotonic() - begin
+        ticks.publish(Clock(clock=to_stamp(now)))
+        said()
+        return float(values_of(states[-1].status[0])['t']) > 0.0
+    wait_until(heard, what='samples on simulated time')
+    wait_until(said, what='complaint of the clock that stopped')
+    assert states[-1].status[0].level == b'\x03'
+    assert estimator.stop() == 0
