@@ -473,7 +473,7 @@ def _largest_first(outliers_of: Mapping[str, Outliers]) -> list[tuple[str, int]]
     return sorted(found, key=lambda f: -abs(float(outliers_of[f[0]].score[f[1]])))
 
 
-def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
+def judge(rows: Sequence[Row]) -> Judgement:
     """Return drifts, and outliers among recordings and vehicles."""
     values = {name: values_of(rows, name) for name in QUANTITIES}
     tested = trends(tuple(values.values()))
@@ -488,12 +488,12 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
                 mine = one.of(t.vehicle) & (one.flights > 0)
                 trend[mine] = t.line(one.flights[mine].astype(np.float64)) - t.line(np.array(
                     0.5 * (t.first + t.last)))
-        recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend, seed=seed)
-        vehicles[name] = _compare_vehicles(one, recordings[name], one.value - trend, rate, seed)
+        recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend)
+        vehicles[name] = _compare_vehicles(one, recordings[name], one.value - trend, rate)
     return Judgement(values, tested, recordings, vehicles)
 
 
-def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int
+def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float
                       ) -> VehicleValues:
     """Compare vehicles (flat: values without drift); packs only with packs of equal cells."""
     names = tuple(sorted(set(values.vehicles) - {''}))
@@ -507,8 +507,7 @@ def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: 
         error[k] = one * (_MEDIAN_ERROR if mine.size > 2 else 1.0)
     # Packs with different numbers of cells belong to different craft.
     cells = tuple(int(values.cells[mine].max()) for mine in of)
-    found = outliers(value, error, [f'{one} cells' for one in cells], rate, least=LEAST_VEHICLES,
-                     seed=seed)
+    found = outliers(value, error, [f'{one} cells' for one in cells], rate, least=LEAST_VEHICLES)
     for kind in set(cells) if values.name in OF_PACK else ():
         # The scatter of a vehicle with one flight is unknown.
         places = [k for k, one in enumerate(cells) if one == kind and of[k].size > 1]

@@ -146,18 +146,16 @@ def _environment_of_workers() -> Iterator[None]:
     """Start processes with one thread each and with Ctrl-C blocked."""
     # A terminal sends Ctrl-C to all processes of the group; the main process ends its workers
     # itself, and their tracebacks would hide its message.
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(_ONE_THREAD)
     # A child inherits the mask; in this process, Ctrl-C is delayed until the child has started.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 

@@ -177,11 +177,6 @@ def simulate_jumps(rng: np.random.Generator, seconds: float) -> list[JumpCrest]:
     return found
 
 
-def largest(found: list[JumpCrest], screen: int) -> JumpCrest:
-    """Return the jumps with the largest mean crest factor on screens of this length, ms."""
-    return max((c for c in found if c.screen == screen), key=lambda c: c.mean)
-
-
 def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     """Return the rows of section 5 on jumps."""
     low, high = published.LOW.crest, published.HIGH.crest
@@ -197,7 +192,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
         # Impulses of this height, mV, would raise the OU to the printed Vpp.
         height = state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
         for ms in JUMP_SCREENS_MS:
-            best = largest(found, ms)
+            best = max((c for c in found if c.screen == ms), key=lambda c: c.mean)
             result.append(Row(
                 'Section 5', f'Vpp/Vrms, {state.label}, jumps, {ms} ms screen', '',
                 Printed(f'{value:.1f}'), best.mean,
@@ -363,10 +358,6 @@ def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
 
 
 def decay_rows(rng: np.random.Generator, draws: int = 60) -> list[Row]:
-    return [*_fit(), *_shape(), *_instrument(simulate_fitted(rng, draws))]
-
-
-def _fit() -> list[Row]:
     line = PAPER_FIT
     return [
         Row('Fig. 5', 'alpha', '1/s', published.ALPHA, line.alpha,
@@ -381,7 +372,8 @@ def _fit() -> list[Row]:
             point=3),
         Row('Fig. 5', '|U(0)|', 'mV', published.FIG_5_MV[0], line.start, 'intercept of that fit',
             f'The line starts at {line.start:.0f} mV, within its error of the first point.',
-            error=line.start_se)]
+            error=line.start_se),
+        *_shape(), *_instrument(simulate_fitted(rng, draws))]
 
 
 def _shape() -> list[Row]:

@@ -230,10 +230,6 @@ def share_above(frequency: float) -> float:
 
 def hardware_and_growth() -> list[Row]:
     """Return the rows of sections 4.1, 4.2, 4.5 and 6."""
-    return [*_hardware(), *_capacitance(), *_growth()]
-
-
-def _hardware() -> list[Row]:
     low, high = ESC_HZ
     nyquist = 0.5 * SAMPLING_HZ
     return [
@@ -243,7 +239,8 @@ def _hardware() -> list[Row]:
             1e-3 * nyquist, 'half of the sampling frequency',
             f'ESC lines at {1e-3 * low:g} to {1e-3 * high:g} kHz are resolved with '
             f'{int(nyquist / high)} harmonics; the OU itself has {percent(share_above(low))} '
-            'of its variance there.')]
+            'of its variance there.'),
+        *_capacitance(), *_growth()]
 
 
 def _capacitance() -> list[Row]:
@@ -324,17 +321,15 @@ def multiplicative() -> SwitchedSystem:
 
 
 def switching_rows(rng: np.random.Generator, paths: int = 20_000) -> list[Row]:
-    return [_potential(), *_intensity(rng, paths), *_drift(rng, paths)]
-
-
-def _potential() -> Row:
     chain = telegraph().generator
     found, _ = quad(lambda t: float(expm(chain.q * t)[0, 0] - chain.stationary[0]),
                     0.0, 40.0 / RATE, epsrel=1e-10)
-    return Row(WHERE, 'R0(0, 0) of a telegraph', 'ms', Printed(f'{1e3 * found:.6g}'),
-               1e3 * float(chain.potential[0, 0]),
-               'printed integral by quadrature, against (Pi - Q)^-1 - Pi',
-               'The definition of the potential is right.')
+    return [
+        Row(WHERE, 'R0(0, 0) of a telegraph', 'ms', Printed(f'{1e3 * found:.6g}'),
+            1e3 * float(chain.potential[0, 0]),
+            'printed integral by quadrature, against (Pi - Q)^-1 - Pi',
+            'The definition of the potential is right.'),
+        *_intensity(rng, paths), *_drift(rng, paths)]
 
 
 def _intensity(rng: np.random.Generator, paths: int) -> list[Row]:
