@@ -294,7 +294,8 @@ class Console:
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node
-        self._waiting = self._next_report = -math.inf
+        # When the topic last had no publisher.
+        self._alone = node.steady_now()
         self._critical = False
 
     def waiting(self, topic: str) -> None:
@@ -302,23 +303,18 @@ class Console:
         # If there is no publisher, log at once, then once a minute; if there is a silent one, log
         # after `MUTE`, then once a minute.
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
-        if self._node.count_publishers(topic):
-            if self._next_report == -math.inf:
-                self._next_report = now + MUTE
-            if now >= self._next_report:
-                self._next_report = now + AGAIN
-                self._node.get_logger().info(
-                    f'{topic} has a publisher, but no message has arrived: it sends none, or runs '
-                    'as another user, whose messages Fast DDS does not deliver (doc/deploy.md).')
-            return
-        self._next_report = -math.inf
-        if now - self._waiting < AGAIN:
-            return
-        self._waiting = now
-        alike = [name for name, _ in self._node.get_topic_names_and_types()
-                 if topic in name and name != topic]
-        hint = f" (there is {', '.join(alike)})" if alike else ''
-        self._node.get_logger().info(f'Waiting for a publisher on {topic}{hint}.')
+        if not self._node.count_publishers(topic):
+            self._alone = now
+            alike = [name for name, _ in self._node.get_topic_names_and_types()
+                     if topic in name and name != topic]
+            hint = f" (there is {', '.join(alike)})" if alike else ''
+            self._node.get_logger().info(f'Waiting for a publisher on {topic}{hint}.',
+                                         throttle_duration_sec=AGAIN)
+        elif now - self._alone >= MUTE:
+            self._node.get_logger().info(
+                f'{topic} has a publisher, but no message has arrived: it sends none, or runs '
+                'as another user, whose messages Fast DDS does not deliver (doc/deploy.md).',
+                throttle_duration_sec=AGAIN)
 
     def flag(self, state: FlagState) -> None:
         """Log when the flag becomes CRITICAL, and when it ends."""
