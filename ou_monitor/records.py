@@ -154,7 +154,7 @@ class Status(enum.Enum):
     OK = 'Estimate is good.'
     SHORT_WINDOW = (
         'The window holds fewer than 25 relaxation times: alpha is uncertain by more '
-        'than a quarter; lengthen the window.')
+        'than a quarter; a longer window, or the same load for longer, helps.')
     NO_DATA = 'No voltage has arrived: check the topic name, the type and the publisher.'
     TOO_FEW_SAMPLES = (
         'Too few samples in the window for a fit: wait, or lengthen the window, or raise '
@@ -164,13 +164,13 @@ class Status(enum.Enum):
         'step is larger than the noise.')
     TOO_SHORT = (
         'The window holds too few relaxation times: alpha is uncertain by more than a factor '
-        'of 10; lengthen the window.')
+        'of 10; a longer window, or the same load for longer, helps.')
     UNBOUND = (
         'No restoring force visible: the voltage wanders through the whole window; lengthen '
         'the window, or look for drift and load changes.')
     BURIED = (
         'The relaxation is buried in measurement noise: alpha is uncertain by a factor of more '
-        'than 2.6; lengthen the window or use a finer ADC.')
+        'than 2.6; a longer window, the same load for longer, or a finer ADC helps.')
     NO_RELAXATION = (
         'No relaxation visible at this rate: the noise has no memory, so it comes from the '
         'sensor, or is faster than the sampling. Slow changes count as changes of the level.')

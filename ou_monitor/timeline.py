@@ -352,8 +352,8 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     return part_of(recording, ~gone, (
         f'{counted(count)} left out: the supply was off {times} '
         f'(near {float(np.median(v[off])):.2g} V), from {float(t[begins[0]] - t[0]):.4g} s on, '
-        f'{seconds:.3g} s in all. Lowest voltage and dips include them, except at the ends of the '
-        'recording.'))
+        f'{seconds:.3g} s in all. Lowest voltage and dips of the whole recording include them, '
+        'except at its ends; fits and simulations do not.'))
 
 
 def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: str,

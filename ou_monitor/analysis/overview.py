@@ -25,7 +25,7 @@ from ou_monitor.text import counted, number, percent, volts
 
 # Largest extrapolated sag that is given, relative to the level: a source with a resistance gives
 # the most power at half its voltage.
-_FARTHEST = 0.5
+FARTHEST = 0.5
 # Minimum ratio of the fitted noise at the ends of the throttle range that is reported as a trend.
 _GROWS = 1.25
 # Minimum share of a recording that its only level must cover to stand for the whole (our choice).
@@ -245,7 +245,7 @@ def _sag_words(found: Overview) -> str:
     if not determined(found, found.flown[1]):
         return f'below {volts(there + 2.0 * se)} at {100.0 * at:.0f} % throttle (95 %){why}'
     words = f'{volts(there)} (+- {volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
-    if at < 1.0 and sag.sag_v[-1] > _FARTHEST * found.load.level:
+    if at < 1.0 and sag.sag_v[-1] > FARTHEST * found.load.level:
         words += '; the law cannot be extrapolated to full throttle'
     elif at < 1.0 and determined(found, -1, flown=False):
         words += (f'; about {volts(sag.sag_v[-1])} (+- {volts(2.0 * sag.se_v[-1])}) extrapolated '
@@ -289,4 +289,4 @@ def _ou_words(ou: OuFacts, whole: OuFacts | None = None) -> str:
         return (f'not visible in {window}: faster than '
                 f'{number(1e3 * ou.tau_below_s)} ms, or below '
                 f'{number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
-    return 'unknown: the recording is too short, or its rate too low'
+    return 'unknown: too few readings, too low a rate, or changes of level that hide it'

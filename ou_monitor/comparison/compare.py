@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.noise import dip_begins, noise_of, remainder, rise_that_ends
+from ou_monitor.analysis.noise import (
+    dip_begins, noise_of, remainder, rise_that_ends, without_wild)
 from ou_monitor.comparison.flight_model import (
     file_simulator, fit_flight, FlightModel, MOVES, Readings)
 from ou_monitor.criticism.adc import without_repeats
@@ -256,7 +257,7 @@ class Yardstick:
         self.levels = [*limits, *low]
         u = np.full(t.size, NAN) if samples.throttle is None else samples.throttle
         flown = Recording(t, v, u, current=samples.current)
-        left = remainder(flown)
+        flown, left = without_wild(flown, remainder(flown))
         self._rise = rise_that_ends(v, u, noise_of(flown, left))
         self._rate = 1.0 / samples.spacing
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))

@@ -24,7 +24,7 @@ from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import whitened
 from ou_monitor.discovery import decision
-from ou_monitor.model.load import INRUSH_TIME
+from ou_monitor.model.load import INRUSH_TIME, LAGS
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, LONGEST, SHORTEST
 from ou_monitor.model.terms.slow import Drift
@@ -33,24 +33,28 @@ from ou_monitor.records import FloatArray
 
 # Number of blocks that are held out in turn.
 FOLDS = 10
-# Usual time constants of the response to throttle, s: inrush, and two of polarisation.
-_USUAL = (INRUSH_TIME, 1.0, 20.0)
+# Time constants, s, from which searches start: those of the node's load model; inrush, and two of
+# polarisation.
+STARTS = (LAGS, (INRUSH_TIME, 1.0, 20.0))
 # Ratio below which two time constants count as equal: half an octave, the spacing of the list.
 _ALIKE = 1.5
 # Steps by which time constants are refined, octaves.
 _FINER = (0.25, 0.125, 0.0625)
 # Maximum number of terms added, removed or exchanged.
 _ROUNDS = 40
+# Prior standard deviation of what one coefficient moves, in ranges of the voltage.  Without it,
+# large terms that nearly cancel describe a delay that is not in the list.
+_LARGEST = 3.0
 
 
-def load_terms(samples: Samples) -> tuple[Term, ...]:
-    """Return a usual response to throttle as terms of the catalogue; none without throttle."""
+def load_terms(samples: Samples, lags: Sequence[float] = LAGS) -> tuple[Term, ...]:
+    """Return a response with time constants, s, as terms; none without throttle."""
     if samples.throttle is None:
         return ()
     duration = float(samples.t[-1] - samples.t[0])
     shortest = float(np.median(samples.step[1:]))
     terms = (LoadSag(0.0, NEXT_TO_ZERO),
-             *(LoadTransient(0.0, tau, 0.0) for tau in _USUAL
+             *(LoadTransient(0.0, tau, 0.0) for tau in lags
                if SHORTEST * shortest <= tau <= LONGEST * duration),
              Drift(0.0, NEXT_TO_ZERO))
     return tuple(term for term in terms if term.NAME in catalogue())
@@ -152,7 +156,10 @@ class _Regression:
         sizes = [len(term.LINEAR) for term in self._pool]
         ends = np.cumsum([2, *sizes])
         self._at = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:])]
-        through[:, 1:] /= np.maximum(np.sqrt(np.mean(through[:, 1:]**2, axis=0)), 1e-300)
+        norm = np.maximum(np.sqrt(np.mean(through[:, 1:]**2, axis=0)), 1e-300)
+        through[:, 1:] /= norm
+        usual = [_usual_size(samples, term, name) for term in self._pool for name in term.LINEAR]
+        self._prior = np.array([0.0, 0.0, *(1.0 / (norm[1:] * usual) ** 2)])
         self._blocks = np.array([part.T @ part for part in np.array_split(through, FOLDS)])
         # All samples, then all but one block each.
         whole = self._blocks.sum(axis=0)
@@ -263,7 +270,7 @@ class _Regression:
         """Return the evidence, and the cost of each held-out block, nats."""
         if chosen not in self._known:
             at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
-            inside, *lost = _losses(self._fitted, self._scored, at).tolist()
+            inside, *lost = _losses(self._fitted, self._scored, at, self._prior[at]).tolist()
             price = sum(self._pool[k].SEARCH + self._pool[k].FORM_COST * self._n for k in chosen)
             value = -max(inside + self._penalty * at.size, sum(lost)) - price
             self._known[chosen] = value, np.array(lost)
@@ -283,11 +290,22 @@ class _Regression:
             and self._evidence(self._with_term(less, j)) > value - decision.TIE))
 
 
-def _losses(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> FloatArray:
+def _usual_size(samples: Samples, term: Term, name: str) -> float:
+    """Return the prior standard deviation of a coefficient, in its unit."""
+    seconds = float(samples.t[-1] - samples.t[0])
+    # What the coefficient multiplies: the load, time or its square.
+    load = 1.0 if samples.throttle is None else float(np.ptp(samples.throttle))
+    of = {'V': load, 'V/s': seconds, 'V/s^2': seconds ** 2}.get(term.unit(name), 0.0)
+    return _LARGEST * float(np.ptp(samples.voltage)) / of if of > 0.0 else math.inf
+
+
+def _losses(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64], prior: FloatArray
+            ) -> FloatArray:
     """Fit columns by each product in `fitted`; return half the squared residuals in `scored`."""
     gram, seen = fitted[:, at[:, None], at], fitted[:, at, 0]
     # The columns are scaled; the ridge keeps equal columns from a division by zero.
-    ridge = 1e-10 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(at.size)
+    ridge = 1e-10 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(
+        at.size) + np.diag(prior)
     beta = np.linalg.solve(gram + ridge, seen[:, :, None])
     inside = (scored[:, at[:, None], at] @ beta)[:, :, 0]
     rest: FloatArray = scored[:, 0, 0] + np.einsum(

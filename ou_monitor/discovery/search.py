@@ -23,7 +23,7 @@ from ou_monitor.criticism.score_statistics import criticise, NullBank
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS
-from ou_monitor.discovery.regression import load_terms, mean_response
+from ou_monitor.discovery.regression import load_terms, mean_response, STARTS
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import (
@@ -79,6 +79,8 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
     for turn in range(decision.MOST):
         if progress is not None:
             progress(turn / decision.MOST)
+        if fitter.cost > 2.0 * decision.MOST_COST:
+            break
         trials = _round(fitter, search, bank, [*given, *removed], latent)
         if not trials:
             break
@@ -293,9 +295,17 @@ _SLOW = 1.0
 
 def under_load(fitter: Fitter, search: Search) -> None:
     """Start from the load model: response to throttle, and noise that follows it, together."""
+    found = [search.copy() for _ in STARTS]
+    for one, lags in zip(found, STARTS):
+        _from_load(fitter, one, load_terms(fitter.samples, lags))
+    best = max(found, key=lambda one: fitter.evidence(one.composite))
+    search.composite, search.accepted, search.rivals = best.composite, best.accepted, best.rivals
+
+
+def _from_load(fitter: Fitter, search: Search, load: Sequence[Term]) -> None:
     # If the terms were added one by one, each would absorb effects of the others.  Afterwards each
     # must be worth its own penalty.
-    load, plain = load_terms(fitter.samples), search.composite
+    plain = search.composite
     noisy = whole_load(fitter, plain, load)
     if noisy is None:
         choose_response(fitter, search, ())

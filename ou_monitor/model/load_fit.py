@@ -72,7 +72,7 @@ class LoadFit:
     falls: bool  # Whether the level falls as the load discharges a pack
     cells: int  # Cells in series
     full: float  # Throttle, or current, A, at a load of 1
-    mean_load: float  # Mean of throttle^1.8 or of the current / full
+    mean_load: float  # Mean of throttle^1.8 or of the absolute current / full
     # Constant level, V; or charge at the first sample, ln of the time, s, in which the mean load
     # empties a full pack, and warming (see WARMING), 1/V.  Then the coefficients, V.
     values: FloatArray
@@ -211,7 +211,7 @@ def fit_load(kind: LoadInput, t: FloatArray, voltage: FloatArray,
     elif kind is LoadInput.THROTTLE:
         x = x ** POWER
     centre, root = _prior(kind, falls, volts, top, cells)
-    model = LoadFit(kind, falls, cells, full, max(1e-3, float(x.mean())), centre, root)
+    model = LoadFit(kind, falls, cells, full, max(1e-3, float(np.abs(x).mean())), centre, root)
     rows, binned = mean(model.regressors(t, load)), mean(voltage)
     noise, levels = _Noise(mean(t), cells), model.levels
 

@@ -13,7 +13,7 @@ from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line, LOW
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.level_tests import NARROW, sigma_change
 from ou_monitor.analysis.noise import BAND
-from ou_monitor.analysis.overview import answers, determined, known_lines
+from ou_monitor.analysis.overview import answers, determined, FARTHEST, known_lines
 from ou_monitor.analysis.quality import faults, QualityItem
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
@@ -239,6 +239,8 @@ def _by_throttle(analysis: Analysis) -> Part:
     for k, (u, flown, fall, se, rms, still, risk) in enumerate(zip(
             sag.throttle, curves.known, sag.sag_v, sag.se_v, noise.rms_v, noise.steady_rms_v,
             curves.risk)):
+        if fall > FARTHEST * analysis.overview.load.level:
+            break
         briefly = analysis.recording.duration * float(np.mean(np.abs(throttle - u) <= BAND))
         rows.append([
             f'{100.0 * u:.0f} %' + ('' if flown else f'\nonly {number(briefly, 2)} s' if briefly

@@ -203,8 +203,10 @@ def _under_load(finding: Finding) -> str:
     factor, unit = (finding.full, ' A') if load == 'current' else (1.0, '')
     low, high = (number(factor * end, 2) + unit for end in (fall.low, fall.high))
     sign, way = (1.0, 'lower') if fall.measured >= 0.0 else (-1.0, 'higher')
-    found = (f'Where {load} is {high} or more, the median voltage is '
-             f'{number(sign * fall.measured, 2)} V {way} than where it is {low} or less (drift '
+    # A current that is negative while it discharges has a negative factor.
+    above, below = ('more', 'less') if factor > 0.0 else ('less', 'more')
+    found = (f'Where {load} is {high} or {above}, the median voltage is '
+             f'{number(sign * fall.measured, 2)} V {way} than where it is {low} or {below} (drift '
              f'included); the model gives {number(sign * fall.explained, 2)} V'
              + ('.' if fall.fits else '; trust the readings.'))
     if dips.count and dips.made is not None:

@@ -50,6 +50,28 @@ def test_a_recording_of_the_model_looks_like_it():
     assert np.mean([one.p_value for one in found]) > 0.2
 
 
+def test_a_pack_that_is_charged_is_compared():
+    """Its current is negative while it lowers the voltage: the mean load is below 0."""
+    rng, t = np.random.default_rng(9), np.arange(3000) * 0.02
+    drawn = 10.0 + lowpass(rng.standard_normal(t.size), t, 0.5) * 35.0
+    v = 15.6 + 0.03 * drawn + 0.01 * rng.standard_normal(t.size)
+    found = compare(Recording(t, v, np.full(t.size, np.nan), current=drawn))
+    assert found.verdict is Likeness.LOOKS_LIKE_IT and found.explained > 0.9
+
+
+def test_dips_are_those_of_the_facts():
+    """Short deep dips do not raise the voltage at which a dip ends."""
+    rng, t = np.random.default_rng(16), np.arange(30000) * 1e-3
+    v = 5.0 + 0.005 * rng.standard_normal(t.size)
+    for begin in (20000, 24000, 28000):
+        v[begin:begin + 30] -= 0.7
+    whole = Recording(t, v, np.full(t.size, np.nan))
+    level = 4.993
+    (row,) = [row for row in compare(whole, levels=(level,)).of('dips') if row.at == (level,)]
+    there = Recording(t[15000:], v[15000:], np.full(15000, np.nan))
+    assert row.measured == pytest.approx(4.0 * supply_facts(there, level).dips.count, rel=0.02)
+
+
 def test_alignment_leaves_an_error_of_the_level():
     """A voltage that wanders for seconds: the level taken from its beginning has an error."""
     # A level without its error made 85 % of such drawings differ with p < 0.05; of 10, more than 3

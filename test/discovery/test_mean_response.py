@@ -8,8 +8,10 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import regression
 from ou_monitor.discovery.discover import discover
+from ou_monitor.discovery.finding import Verdict
 from ou_monitor.discovery.regression import (
     _contains, _is_near, _Regression, mean_response)
+from ou_monitor.model.load import lowpass
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
@@ -50,7 +52,9 @@ def made(pool, columns, voltage, monkeypatch):
     through = np.column_stack([voltage, np.ones(N), *columns])
     monkeypatch.setattr(regression, 'whitened', lambda *given: through.copy())
     model = SimpleNamespace(terms=(), events=None, offset=None)
-    return _Regression(SimpleNamespace(n=N), model, pool), through
+    samples = SimpleNamespace(n=N, t=np.arange(N) / 20.0, voltage=voltage,
+                              throttle=np.linspace(0.0, 1.0, N))
+    return _Regression(samples, model, pool), through
 
 
 @pytest.fixture
@@ -129,6 +133,21 @@ def test_a_time_constant_between_those_of_the_list_is_measured(seed):
     (lag,) = [cause.term for cause in found.causes if isinstance(cause.term, LoadTransient)]
     assert lag.tau == pytest.approx(1.5, rel=0.07)
     assert not any(isinstance(cause.term, SecondRelaxation) for cause in found.causes)
+
+
+@pytest.mark.parametrize('rate, delay', [(50.0, 0.3), (100.0, 0.13), (500.0, 0.036)])
+def test_throttle_that_is_late_by_any_whole_steps_is_one_cause(rate, delay):
+    """Not several large responses that nearly cancel, nor a drift."""
+    rng, n = np.random.default_rng(7), int(40.0 * rate)
+    t, late = np.arange(n) / rate, round(delay * rate)
+    u = lowpass(np.repeat(rng.uniform(0.1, 0.9, 41), int(rate))[:n], t, 0.3)
+    u = u + 0.01 * rng.standard_normal(n)
+    v = 16.2 - 2.0 * np.append(np.full(late, u[0]), u[:-late]) + 0.02 * rng.standard_normal(n)
+    found = discover(Recording(t, v, u, 'made'))
+    (cause,) = found.causes
+    assert (found.verdict, cause.name) == (Verdict.EXPLAINED, 'load_transient')
+    assert cause.term.delay == pytest.approx(delay)
+    assert cause.term.gain == pytest.approx(-2.0, abs=0.02)
 
 
 @pytest.mark.parametrize('seed', [4, 6])

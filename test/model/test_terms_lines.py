@@ -1,10 +1,11 @@
 """Lines and 1/f noise: frequency, amplitude, width, spectrum."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor.model.terms.term import View
-from ou_monitor.model.terms.tones import CONSTANT, power_spread, RINGING
+from ou_monitor.model.terms.tones import CONSTANT, power_spread, Resonance, RINGING, Tone
 import pytest
 from scipy.signal import welch
 from term_examples import clusters, has_covariance, still, term
@@ -103,6 +104,15 @@ def test_flicker_samples_have_that_spectrum():
         # 2 % of the stated law, and the statistics.
         assert 6.0 * error < 0.15
         assert abs(np.mean(psd[band] * f[band]) / 0.09 - 1.0) < 0.02 + 4.0 * error
+
+
+@pytest.mark.parametrize('frequency, holds', [(40.0, True), (60.0, False)])
+def test_no_line_and_no_ringing_is_above_half_the_rate(frequency, holds):
+    rng, t = np.random.default_rng(3), np.arange(2000) / 100.0
+    view = SimpleNamespace(rate=100.0, at=t, residual=0.0 * t, z=rng.standard_normal(t.size))
+    assert Tone(0.1, frequency, 0.0, 0.5).holds(view) == holds
+    assert Resonance(frequency, 60.0, 0.1, 0.0).holds(view) == holds
+    assert math.isnan(power_spread(view, 30.0, 1.0))
 
 
 def test_the_powers_of_ringing_spread_and_those_of_a_line_do_not():

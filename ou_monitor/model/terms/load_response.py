@@ -13,11 +13,17 @@ from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.term import (
     by_parameters, Effect, NEXT_TO_ZERO, parameter, parameters, Role, Segment, Stage, Term, View)
 from ou_monitor.records import FloatArray
+from scipy.signal import correlate
 
 
 # Evidence required for a growth in addition to the penalty of its parameter, nats.  Without this
 # requirement, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
 _GROWS = 6.0
+# Meaning and remedy of a sag.
+_FALLS = ('The mean falls with throttle: IR drop of battery, leads and regulator. The estimates '
+          'are settled values; sag and resistance of the supply refer to 1 s after a step.')
+_LESS = ('Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
+         'reduce it.')
 
 
 @dataclass(frozen=True)
@@ -41,12 +47,11 @@ class LoadSag(Term):
     SEARCH = by_parameters(0.0, lambda term: _GROWS if term.growth else 0.0)
     MEASURED = True
     LIVE = True
-    MEANING = (
-        'The mean falls with throttle: IR drop of battery, leads and regulator. The estimates are '
-        'settled values; sag and resistance of the supply refer to 1 s after a step.')
-    REMEDY = (
-        'Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
-        'reduce it.')
+    MEANING = by_parameters(
+        _FALLS, lambda term: _FALLS if term.falls() else
+        'The mean rises with throttle, as if throttle were inverted or not the load.')
+    REMEDY = by_parameters(_LESS, lambda term: _LESS if term.falls() else
+                           'Check topic, unit and sign of throttle.')
     SEPARATED_BY = 'throttle held for some seconds at several levels'
 
     linear: float = parameter('V', 'drop at full throttle, linear part',
@@ -58,6 +63,10 @@ class LoadSag(Term):
     def change(self, s: Segment) -> None:
         linear = self.linear + self.growth * (s.at - s.origin)
         s.level -= (linear + self.square * s.throttle) * s.throttle
+
+    def falls(self) -> bool:
+        """Return whether full throttle lowers the voltage."""
+        return self.linear + self.square >= 0.0
 
     def at(self, t: float) -> LoadSag:
         """Return the sag t seconds after the first sample, without growth."""
@@ -183,7 +192,8 @@ class LoadTransient(Term):
             SHORTEST * step, longest, count)]
         # A pure delay, of whole steps, is a response that never decays.
         latest = max(_LATEST, 4.0 * step)
-        delays = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
+        delays = np.unique(np.append(np.rint(np.geomspace(step, latest, _DELAYS) / step),
+                                     _likely_delay(view, round(latest / step)))) * step
         late = [cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in delays]
         return tuple(form for term in (*lags, *late) for form in term.forms(view.by_current))
 
@@ -219,9 +229,20 @@ _ABOUT = {
                     'regulator corrects it, or a battery warms.',
                     LoadTransient.REMEDY)}
 # Number of delays to try, and maximum delay, s.
-_DELAYS, _LATEST = 12, 0.1
+_DELAYS, _LATEST = 16, 0.5
 # Time constant, in durations of the recording, for a response that never decays.
-_LASTING = 100.0
+_LASTING = 1e5
+
+
+def _likely_delay(view: View, latest: int) -> int:
+    """Return the delay, in steps, at which throttle, whitened, tells most of the scores."""
+    if view.throttle is None:
+        return 1
+    u = view.throttle.copy()
+    u[1:] -= view.phi[1:] * view.throttle[:-1]
+    u = (u / np.sqrt(view.variance))[view.train]
+    product = correlate(view.z[view.train], u - u.mean())[u.size:][:latest]
+    return 1 + int(np.argmax(np.abs(product))) if product.size else 1
 
 
 @dataclass(frozen=True)
@@ -489,7 +510,7 @@ class LoadDependentNoise(Term):
     APART = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
     CHANGES = MeasurementNoise
     MEANING = (
-        'The white noise of the readings grows with throttle or its changes: ripple of the ESCs, '
+        'The white noise of the readings depends on throttle or its changes: ripple of the ESCs, '
         'or a rail that relaxes faster than the sampling, which looks the same.')
     REMEDY: ClassVar[str] = by_parameters(
         'Sample faster to tell ripple from a fast rail; against ripple, add capacitance at the '

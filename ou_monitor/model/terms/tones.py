@@ -74,7 +74,7 @@ class Tone(Term):
 
     def holds(self, view: View) -> bool:
         """Return whether this is a line rather than ringing."""
-        return self.linewidth < SHARP * self.frequency and (
+        return self.linewidth < SHARP * self.frequency < 0.5 * SHARP * view.rate and (
             self.linewidth < WIDEST
             or not power_spread(view, self.frequency, self.linewidth) > CONSTANT)
 
@@ -204,7 +204,7 @@ class Resonance(Term):
         """Return whether this oscillates, and decays faster than a line."""
         width = self.damping / math.pi
         # It is ringing if its line is too wide for a tone, or if its amplitude varies.
-        return width < 2.0 * self.frequency and (width >= SHARP * self.frequency or (
+        return width < 2.0 * self.frequency < view.rate and (width >= SHARP * self.frequency or (
             width > WIDEST and not power_spread(view, self.frequency, width) < RINGING))
 
 
@@ -345,7 +345,7 @@ def power_spread(view: View, frequency: float, linewidth: float) -> float:
     turned = (v - v.mean()) * np.exp(-2j * math.pi * (frequency * at % 1.0))
     power = np.abs(turned[:count * length].reshape(count, length) @ np.hanning(length)) ** 2
     low, middle, high = np.percentile(power, [25.0, 50.0, 75.0]).tolist()
-    return float((high - low) / middle)
+    return float((high - low) / middle) if middle > 0.0 else NAN
 
 
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
