@@ -23,7 +23,7 @@ from ou_monitor.discovery.gain import (
     without)
 from ou_monitor.discovery.load_effects import load_fall, low_dips
 from ou_monitor.discovery.named import (
-    Named, named_causes, prune_by_gain, Pruned, refusal)
+    Named, named_causes, prune_by_gain, Pruned, refusal, Result)
 from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
@@ -79,8 +79,9 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         done(0.1)
         named = named_causes(inside, start, rng, state.exact,
                              lambda share: done(0.1 + 0.5 * share))
-        model, names = (named.whole, named.names) if inside is samples else _fit_to_codes(
-            samples, state, named)
+        found = named.found
+        model, names = (found.whole, found.search.accepted) if inside is samples else (
+            _fit_to_codes(samples, state, found))
         plain = _plain_model(samples)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
@@ -95,23 +96,22 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     left = prune_by_gain(samples, model, names, plain, scored,
                          lambda share: done(0.6 + 0.3 * share))
     whole = left.full.model
-    after = named.after
-    if len(left.names) < len(named.names):
+    after, accepted = found.after, found.search.accepted
+    if len(left.names) < len(accepted):
         less = whole if inside is samples else _refitted(
             inside, [term for term in whole.terms if term.NAME != 'quantization'])
         after = after if less is None else criticise(inside, less, named.bank)
-    dropped = (*named.dropped, *left.out, *(name for name in named.names if name not in names))
+    dropped = (*named.dropped, *left.out, *(name for name in accepted if name not in names))
     se = tuple(with_reach(term, found, samples) for term, found in zip(
         whole.terms, standard_errors(samples, whole, slice(0, samples.n)), strict=True))
     done(0.95)
     load = 'current' if math.isfinite(state.full) else 'throttle'
     causes = tuple(replace(cause, explanation=by_load(cause.explanation, load)) for cause in
-                   _causes(samples, state, left, se, scored, named.rivals))
+                   _causes(samples, state, left, se, scored, found.search.rivals))
     gain, gain_se = gain_of(left.full, plain, scored)
     unknown = why_unknown(left.full, plain, scored, bool(uncovered))
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
     criticism = _criticism(named.before, after)
-    remaining = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
     growth = growth_of(left.full, plain, scored)
     larger = growth > 1.0
     refused = refusal(samples, whole.terms, gain, gain_se, growth > Z95) if causes else ''
@@ -124,9 +124,9 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     against = doubts(whole.terms, dips, recording.duration,
                      float(np.median(samples.step[1:])), larger, fall,
                      _of_the_path(whole, samples)) if causes else ()
-    verdict = judge(remaining, len(causes), against)
+    verdict = judge([c for c in criticism if c.is_off], len(causes), against)
     done(1.0)
-    found = Finding(
+    finding = Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
         baseline=baseline, baseline_score=mean_score(plain.density, scored & plain.known),
         criticism=criticism, causes=causes, model=SupplyModel((*whole.terms, *undone)),
@@ -138,8 +138,8 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
             named, whole, dropped, samples, uncovered))),
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
         full=state.full, has_throttle=recording.has_throttle, seed=seed)
-    return replace(found, words=verdict_words(
-        found, why, named.dropped, uncovered, against))
+    return replace(finding, words=verdict_words(
+        finding, why, named.dropped, uncovered, against))
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
@@ -192,19 +192,19 @@ def _within_codes(samples: Samples, state: Integrity, start: Composite
     return inside, start
 
 
-def _fit_to_codes(samples: Samples, state: Integrity, named: Named
-                  ) -> tuple[Composite, tuple[str, ...]]:
+def _fit_to_codes(samples: Samples, state: Integrity, found: Result
+                  ) -> tuple[Composite, list[str]]:
     """Fit the named model to the codes; return it and its causes, without terms that fail."""
     steps = [term for term in state.exact if term.ROLE is Role.NOISE]
-    terms, names = list(named.whole.terms), list(named.names)
+    terms, names = list(found.whole.terms), list(found.search.accepted)
     while True:
         try:
-            found = _refitted(samples, [terms[0], *steps, *terms[1:]])
+            model = _refitted(samples, [terms[0], *steps, *terms[1:]])
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             # Parameters out of range, or an overflow.
-            found = None
-        if found is not None:
-            return found, tuple(names)
+            model = None
+        if model is not None:
+            return model, names
         if len(terms) == 1:
             raise ArithmeticError('the model within codes does not fit the codes')
         names.remove(terms.pop().NAME)

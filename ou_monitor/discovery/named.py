@@ -22,7 +22,7 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, standard_errors
 from ou_monitor.discovery.gain import cause_gain, held_out, HeldOut, without
 from ou_monitor.discovery.search import (
-    kinds_of, name_causes, outside_range, position, Progress, Search, under_load, without_causes)
+    name_causes, outside_range, position, Progress, Search, under_load, without_causes)
 from ou_monitor.discovery.words import is_vague
 from ou_monitor.model.terms.catalogue import blamed, catalogue
 from ou_monitor.model.terms.term import Role, Term
@@ -36,18 +36,23 @@ STOPPED = ('The search for causes was cut short because the next ones would have
            'there may be more.')
 
 
-@dataclass(frozen=True, eq=False)
-class Named:
-    """Result of the search."""
+@dataclass(frozen=True)
+class Result:
+    """A search, its model fitted to everything, and the statistics of that model."""
 
-    whole: Composite  # Model fitted to everything
-    bank: NullBank  # Calibration of the statistics
-    names: tuple[str, ...]  # Causes in the order of acceptance
-    rivals: Mapping[str, list[str]]  # For each cause, the causes that tie with it
-    dropped: tuple[str, ...]  # Causes that were withdrawn
-    # Statistics of the plain and of the extended model.
-    before: Mapping[str, float]
+    search: Search
+    whole: Composite
     after: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Named:
+    """Result of all searches."""
+
+    found: Result
+    bank: NullBank  # Calibration of the statistics
+    dropped: tuple[str, ...]  # Causes that were withdrawn
+    before: Mapping[str, float]  # Statistics of the plain model
     failure: str  # Why the search ended early; otherwise empty
 
 
@@ -58,7 +63,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     before = criticise(samples, start, bank)
     fitter = Fitter(samples, start.cost)
     search = Search(fitter.fit(start.terms, start) or start)
-    found = _Result(search.copy(), start, before)
+    found = Result(search.copy(), start, before)
     given = [term.NAME for term in exact]
     failure, begun = '', None
     dropped: list[str] = []
@@ -95,38 +100,28 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     if failure and begun is not None:
         # Once the load model has been chosen, any state of the search can be used.
         found = _fit_everything(fitter, search, bank)
-    names = found.search.accepted
-    return Named(found.whole, bank, tuple(names), found.search.rivals,
-                 tuple(name for name in dict.fromkeys(dropped) if name not in names), before,
-                 found.after, failure or (STOPPED if search.stopped else ''))
+    return Named(found, bank, tuple(name for name in dict.fromkeys(dropped)
+                                    if name not in found.search.accepted),
+                 before, failure or (STOPPED if search.stopped else ''))
 
 
-@dataclass(frozen=True)
-class _Result:
-    """A search, its model fitted to everything, and the statistics of that model."""
-
-    search: Search
-    whole: Composite
-    after: Mapping[str, float]
-
-
-def _fit_everything(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
+def _fit_everything(fitter: Fitter, search: Search, bank: NullBank) -> Result:
     """Return a search with its model fitted to everything, held-out events included."""
     whole = fitter.whole(search.composite)
-    return _Result(search.copy(), whole, criticise(fitter.samples, whole, bank))
+    return Result(search.copy(), whole, criticise(fitter.samples, whole, bank))
 
 
-def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
+def _withdrawn(fitter: Fitter, found: Result, begun: Result) -> list[int]:
     """Return the causes that do not explain their statistics, or no longer fit their name."""
     names = found.search.accepted
-    out = decision.withdrawn(begun.after, found.after, kinds_of(names),
-                             found.search.before_accepted)
+    kinds = [catalogue()[name] for name in names]
+    out = decision.withdrawn(begun.after, found.after, kinds, found.search.before_accepted)
     # Noise terms of the load model stay.
     out = [k for k in out if names[k] not in begun.search.accepted]
     view = fitter.view(found.whole)
     return sorted({*out,
                    # Causes with states of their own that no longer fit their name.
-                   *(k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
+                   *(k for k, kind in enumerate(kinds) if kind.ROLE is Role.BLOCK
                      and not found.whole.terms[position(found.whole, names, k)].holds(view))})
 
 
@@ -169,11 +164,10 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None and (
             k in vague or not decision.improves_predictions(worth.gain, worth.error, worth.chance)
             and not _absorbs_trend(samples, state, k))]
-        worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
-                 if failing else _cause_of_straying(samples, state))
-        if worst is None or turn == _ROUNDS - 1:
+        if not failing or turn == _ROUNDS - 1:
             break
-        _leave_out(state, worst)
+        _leave_out(state, min(failing, key=lambda k: (
+            -state.worth[k].chance, state.worth[k].gain)))
     return state
 
 
@@ -193,38 +187,15 @@ def _undetermined(samples: Samples, state: Pruned) -> list[int]:
 
 
 def _leave_out(state: Pruned, worst: int) -> None:
-    """Remove a cause and the terms that depend on it."""
+    """Remove a cause, and those that the model without it lacks."""
     less = state.worth[worst].less
     assert less is not None
-    kept = {term.NAME for term in less.model.terms}
-    gone = state.names[worst]
-    many = state.worth[worst].size > 1
-    left = [name for k, name in enumerate(state.names)
-            if k != worst and not (many and name == gone)
-            and (name in kept or name == gone)]
-    state.out += [name for name in set(state.names) if state.names.count(name)
-                  > left.count(name)]
+    there = [term.NAME for term in less.model.terms]
+    rest = state.names[:worst] + state.names[worst + 1:]
+    left = [name for k, name in enumerate(rest) if rest[:k].count(name) < there.count(name)]
+    state.out += [name for name in dict.fromkeys(state.names)
+                  if state.names.count(name) > left.count(name)]
     state.names, state.full = left, less
-
-
-def _cause_of_straying(samples: Samples, state: Pruned) -> int | None:
-    """Return the cause, if any, whose removal keeps simulations within the recorded range."""
-    # A term may improve one-step predictions although its simulations exceed the recorded range.
-    # Responses of the mean are not tested.
-    def far_of(model: Composite) -> float:
-        try:
-            return outside_range(samples, model.terms)
-        except ValueError:
-            return math.inf
-
-    far = far_of(state.full.model)
-    if not far > 0.0:
-        return None
-    other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
-             if worth.less is not None and not decision.is_response(catalogue()[state.names[k]])}
-    # The single cause with the least gain; combinations are not tried.
-    return min((k for k, stays in other.items() if not stays > 0.0), default=None,
-               key=lambda k: state.worth[k].gain)
 
 
 def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:

@@ -156,11 +156,6 @@ def position(model: Composite, names: Sequence[str], k: int) -> int:
     return [i for i, term in enumerate(model.terms) if term.NAME == names[k]][nth]
 
 
-def kinds_of(names: Sequence[str]) -> list[type[Term]]:
-    """Return the kinds of causes."""
-    return [catalogue()[name] for name in names]
-
-
 def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str], latent: bool
            ) -> list[Trial]:
     """Return the trials of a round that may be accepted, best first."""
@@ -213,19 +208,11 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class _Move:
-    """A model without a cause, or with another one in its place."""
-
-    name: str  # Name of the cause
-    replacement: str  # Name of the other one; empty: none
-    model: Composite
-    gain: float  # Evidence above the required minimum, nats
-
-
 def _make_best_move(fitter: Fitter, search: Search) -> bool:
     """Make the best removal or exchange of one cause; return whether there was one."""
-    value, moves = fitter.evidence(search.composite), []
+    value = fitter.evidence(search.composite)
+    # Evidence above the required minimum, nats; cause; its replacement, empty for none; model.
+    moves: list[tuple[float, str, str, Composite]] = []
     names = dict.fromkeys(name for name in search.accepted
                           if not decision.is_response(catalogue()[name]))
     swapped: dict[str, list[str]] = {name: [] for name in names if catalogue()[name] in LAWS}
@@ -237,24 +224,25 @@ def _make_best_move(fitter: Fitter, search: Search) -> bool:
         if value - fitter.evidence(less) < needed + _ROUGH:
             less = _refit(fitter, less)
         if fitter.holds(less):
-            moves.append(_Move(name, '', less, needed - value + fitter.evidence(less)))
+            moves.append((needed - value + fitter.evidence(less), name, '', less))
         for kind in _replacements(less, name):
             found = fitter.best_start(less, kind, fitter.view(less))
             if found is None or fitter.evidence(found) < value - _ROUGH or not fitter.holds(found):
                 continue
             found = _refit(fitter, found)
-            moves.append(_Move(name, kind.NAME, found, fitter.evidence(found) - value))
-            if moves[-1].gain > -decision.TIE and kind.NAME != name:
+            moves.append((fitter.evidence(found) - value, name, kind.NAME, found))
+            if moves[-1][0] > -decision.TIE and kind.NAME != name:
                 swapped[name].append(kind.NAME)
-    best = max(moves, default=None, key=lambda move: move.gain)
-    if best is None or not best.gain > 0.1:
+    gain, gone, replacement, model = max(moves, default=(0.0, '', '', search.composite),
+                                         key=lambda move: move[0])
+    if not gain > 0.1:
         for name, others in swapped.items():
             search.rivals[name] = others
         return False
-    at = len(search.accepted) - 1 - search.accepted[::-1].index(best.name)
-    search.accepted[at:at + 1] = [best.replacement] if best.replacement else []
-    search.accepted = [name for name in search.accepted if best.model.has(name)]
-    search.composite = best.model
+    at = len(search.accepted) - 1 - search.accepted[::-1].index(gone)
+    search.accepted[at:at + 1] = [replacement] if replacement else []
+    search.accepted = [name for name in search.accepted if model.has(name)]
+    search.composite = model
     return True
 
 

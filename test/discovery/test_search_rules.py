@@ -154,14 +154,14 @@ def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
                         search.accepted.append('drift'))
     monkeypatch.setattr(rules_of_names, 'name_causes', add)
     monkeypatch.setattr(rules_of_names, '_fit_everything', lambda fitter, search, bank:
-                        rules_of_names._Result(search.copy(), search.composite, {}))
+                        rules_of_names.Result(search.copy(), search.composite, {}))
     monkeypatch.setattr(rules_of_names, '_withdrawn', lambda fitter, found, begun: [
         k for k, name in enumerate(found.search.accepted) if name == NOISE.NAME])
     monkeypatch.setattr(rules_of_names, 'without_causes', lambda fitter, search, out: replace(
         search, composite=Model([], 5.0), accepted=['drift']))
     start = Model([BASE], 0.0)
     found = rules_of_names.named_causes(SimpleNamespace(t=np.arange(3.0)), start, None, (), print)
-    assert list(found.names) == named and found.dropped == (NOISE.NAME,)
+    assert found.found.search.accepted == named and found.dropped == (NOISE.NAME,)
 
 
 LAWS = {'s': SIGMA, 'n': LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5)),
