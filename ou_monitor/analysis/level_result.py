@@ -38,7 +38,7 @@ import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.analysis.levels import LoadLevel
 from ou_monitor.analysis.noise import Remainder
-from ou_monitor.criticism.curves import bin_width, even_on_log
+from ou_monitor.criticism.curves import even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, sampled_spectrum
 from ou_monitor.model.ou_fit import fit_pieces, white_variance
 from ou_monitor.model.spectral_lines import (
@@ -371,8 +371,8 @@ class LevelResult:
         if self.n < _LEAST_BINNED or not self.vrms > 0.0:
             return np.zeros(0), np.zeros(0)
         z = self.deviation / self.vrms
-        # Bins of a width that suits a plot.
-        width = min(max(bin_width(z), 0.05), 0.5)
+        # Bins by Freedman and Diaconis (1981), but of a width that suits a plot.
+        width = min(max(2.0 * float(stats.iqr(z)) / z.size ** (1.0 / 3.0), 0.05), 0.5)
         edges = np.arange(-6.0, 6.0 + width, width)
         return edges, np.histogram(z, edges)[0] / (self.n * np.diff(edges))
 

@@ -47,9 +47,8 @@ class Composite:
 
     def score(self, samples: Samples) -> float:
         """Return the penalised log density of the fitted part and the held-out part, nats."""
-        n = samples.train.stop
-        return float(self.density[samples.train].sum() + self.density[samples.test].sum()
-                     - 0.5 * self.free * math.log(n) - self.search)
+        return float(self.density.sum() - 0.5 * self.free * math.log(samples.train.stop)
+                     - self.search)
 
     def has(self, name: str) -> bool:
         """Return whether the model has a term of that name."""

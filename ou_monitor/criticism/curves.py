@@ -7,12 +7,6 @@ import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
 
-def bin_width(values: FloatArray) -> float:
-    """Return the width of histogram bins by the rule of Freedman and Diaconis (1981)."""
-    low, high = np.quantile(values, [0.25, 0.75])
-    return float(2.0 * (high - low) / values.size ** (1.0 / 3.0))
-
-
 def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return the corners of a histogram, from the first edge to the last."""
     return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(heights, dtype=np.float64), 2)

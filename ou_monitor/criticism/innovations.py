@@ -70,23 +70,16 @@ def steps_before(t: FloatArray) -> FloatArray:
     return step
 
 
-def ou_filter(t: FloatArray, alpha: float, var_inf: float, noise_var: float,
-              first: float = NAN) -> Filter:
-    """Return the filter of an OU in white noise at t, s (first: its variance at t[0], V^2)."""
-    dt = steps_before(t)[1:]
-    q = np.append(var_inf if math.isnan(first) else first,
-                  -var_inf * np.expm1(-2.0 * alpha * dt))
-    f = np.append(0.0, np.exp(-alpha * dt))
-    r = np.full(t.size, max(noise_var, _NO_NOISE * float(q.min())))
-    return Filter(StateSpace(f[:, None, None], q[:, None, None], np.ones(1), r))
-
-
 def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: float,
                 noise_var: float) -> FloatArray:
     """Return the standardised one-step innovations of a sampled OU in white noise (s, V)."""
     if deviation.size < 2 or not math.isfinite(alpha):
         return deviation / math.sqrt(var_inf + noise_var)
-    run = ou_filter(t, alpha, var_inf, noise_var)
+    dt = steps_before(t)[1:]
+    q = np.append(var_inf, -var_inf * np.expm1(-2.0 * alpha * dt))
+    f = np.append(0.0, np.exp(-alpha * dt))
+    r = np.full(t.size, max(noise_var, _NO_NOISE * float(q.min())))
+    run = Filter(StateSpace(f[:, None, None], q[:, None, None], np.ones(1), r))
     return np.asarray(run.innovations(deviation) / np.sqrt(run.variance))
 
 

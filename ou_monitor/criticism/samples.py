@@ -79,11 +79,6 @@ class Samples:
         """Return the part for fitting."""
         return slice(0, round(TRAIN * self.n))
 
-    @property
-    def test(self) -> slice:
-        """Return the part for scoring."""
-        return slice(round(TRAIN * self.n), self.n)
-
     def part(self, part: slice, voltage: FloatArray | None = None) -> Samples:
         """Return a part of the samples, with another voltage if one is given."""
         return replace(

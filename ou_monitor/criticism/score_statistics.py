@@ -51,11 +51,6 @@ class Covariates:
     paths: tuple[tuple[str, FloatArray], ...] = ()  # As `throttle_paths` yields them; shape (n,)
 
 
-def statistics(z: FloatArray, given: Covariates, *, lines: bool = True) -> dict[str, float]:
-    """Return all statistics."""
-    return dict(_all(z, given, lines))
-
-
 def is_sign(sign: str, name: str, value: float) -> bool:
     """Return whether a statistic matches a sign."""
     if sign[0] in '+-':
@@ -63,24 +58,21 @@ def is_sign(sign: str, name: str, value: float) -> bool:
     return name.startswith(sign)
 
 
-def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, float]]:
+def statistics(z: FloatArray, given: Covariates, *, lines: bool = True) -> dict[str, float]:
+    """Return all statistics."""
     # An outlier must not dominate statistics of other kinds.
     w = np.clip(z, -5.0, 5.0)
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
-    yield from _correlations(w)
-    yield from _spectrum(w, given)
+    found = dict([*_correlations(w), *_spectrum(w, given)])
     if lines and given.throttle is not None:
         # The strongest line whose frequency follows throttle.
         top, count = order_power(w, given.throttle, given.rate)
-        yield 'order line', _from_tail(-math.expm1(-count * math.exp(-top))) if count else 0.0
-    yield from _moments(z)
-    yield from _clustering(square, given)
-    yield from _inputs(w, square, given)
-    yield from _state(w, square, given)
-    for name, path in given.paths:
-        yield name, score(w, path)
-    yield from _beyond_second_order(w, given)
+        found['order line'] = _largest(top, count) if count else 0.0
+    return dict([*found.items(), *_moments(z), *_clustering(square, given),
+                 *_inputs(w, square, given), *_state(w, square, given),
+                 *((name, score(w, path)) for name, path in given.paths),
+                 *_beyond_second_order(w, given)])
 
 
 def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
@@ -110,21 +102,16 @@ def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
             yield f'band {k}, {_hertz(a, n, given)} to {_hertz(b, n, given)} Hz', value
     # The largest of many exponentials.  The spectrum is flat under the null hypothesis of the
     # bank; `find_lines`, which decides which lines are tried, allows for other spectra.
-    yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
+    yield 'line', _largest(float(power[3:].max()), power.size - 3)
 
 
 def _hertz(bin_: int, n: int, given: Covariates) -> str:
     return f'{max(bin_, 1) * given.rate / n:.3g}'
 
 
-def _gumbel(top: float, count: float) -> float:
+def _largest(top: float, count: float) -> float:
     """Return the normal score of the largest of `count` exponentials."""
-    chance = -math.expm1(-count * math.exp(-top)) if top < 700.0 else 0.0
-    return _from_tail(chance if chance > 0.0 else math.exp(-700.0))
-
-
-def _from_tail(chance: float) -> float:
-    return -float(ndtri(min(max(chance, 1e-300), 0.999)))
+    return -float(ndtri(min(max(-math.expm1(-count * math.exp(-top)), 1e-300), 0.999)))
 
 
 def _moments(z: FloatArray) -> Iterator[tuple[str, float]]:

@@ -31,8 +31,7 @@ _STEP = 1e-4
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
 # Samples times additional states above which a fit begins with a part of the samples.
 _EXPENSIVE = 30000
-# With more states than this, only a part of the samples is fitted; more lines than this are fitted
-# separately.
+# With more states than this, only a part of the samples is fitted.
 _MANY = 4
 # Samples after which the gain of a time-invariant filter is constant (predictive variance within
 # 1e-5 of its limit).
@@ -86,7 +85,7 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
-    fit = _fit_terms(chosen, tuple(terms), inside, rough, begun)
+    fit = _maximise(chosen, tuple(terms), inside, rough, begun=begun)
     cost = fit.cost
     if whole_mean and chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
@@ -100,7 +99,8 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
     """Filter with given parameters (inside: variances include the event at each sample)."""
     run = _filter(samples, terms, events)
-    mean = mean_of(samples, terms, run.segment)
+    beta = [value for term in terms for value in coefficients(term)]
+    mean = design_of(samples, terms, run.segment)[:, 1:] @ np.array(beta)
     e = run.kalman.innovations(samples.voltage - mean)
     # Exclude the event at each sample, because a law predicts it.  Only the fit of the Gaussian
     # part, which has no laws, includes the event.
@@ -118,14 +118,14 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
     # offset, V, is always subtracted.
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
-    columns = columns_of(samples, (*kept, *more), run.segment)
+    design = design_of(samples, (*kept, *more), run.segment)
     voltage = samples.voltage if offset is None else samples.voltage - offset
     fixed = [] if own else [k for k, term in enumerate(owners(terms))
                             if term is not None and not term.MEASURED]
     if fixed:
         beta = np.array([value for term in terms for value in coefficients(term)])
-        voltage = voltage - columns_of(samples, terms, run.segment)[:, fixed] @ beta[fixed]
-    through = run.kalman.innovations(np.column_stack((voltage, columns)))
+        voltage = voltage - design_of(samples, terms, run.segment)[:, 1:][:, fixed] @ beta[fixed]
+    through = run.kalman.innovations(np.column_stack((voltage, design[:, 1:])))
     return np.asarray(through / np.sqrt(run.full)[:, None], dtype=np.float64)
 
 
@@ -146,7 +146,8 @@ class _Run:
 
 
 def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _Run:
-    if events is not None and _states(terms) >= _MANY and not events.error.any():
+    states = 1 + sum(term.STATES for term in terms if term.ROLE is Role.BLOCK)
+    if events is not None and states >= _MANY and not events.error.any():
         # Extra variance hardly changes the gains if there are several states, so the filter has
         # constant gains, which saves most of the time.
         s, space, _ = state_space(samples, terms, None)
@@ -165,10 +166,6 @@ def _filter_cost(space: StateSpace, n: int) -> float:
     return 1e-7 * length * states * states + 2e-8 * n * states
 
 
-def _states(terms: Sequence[Term]) -> int:
-    return 1 + sum(term.STATES for term in terms if term.ROLE is Role.BLOCK)
-
-
 def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
                 ) -> tuple[Segment, StateSpace, FloatArray | float]:
     """Return segment, state space, and the variance that events add to each prediction, V^2."""
@@ -178,7 +175,9 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
             term.ROLE is Role.DRIVE or (term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE)
             or isinstance(term, JitterOnLines)
             for term in terms):
-        s = _first(s, _SETTLES)
+        s = replace(s, **{name: getattr(s, name)[:_SETTLES] for name in (
+            't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
+            'noise', 'voltage')})
     n = s.t.size
     phi, q = s.phi, s.added
     floor = NO_NOISE * q[1:].mean()
@@ -245,12 +244,6 @@ def slope_of_lines(samples: Samples, terms: Sequence[Term]) -> FloatArray:
     return slope
 
 
-def _first(s: Segment, n: int) -> Segment:
-    return replace(s, **{name: getattr(s, name)[:n] for name in (
-        't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
-        'noise', 'voltage')})
-
-
 def _coupled_block(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
                    ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the block of the OU and of its low-pass, which an AC coupling subtracts."""
@@ -267,29 +260,6 @@ def _coupled_block(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
     cov[0] = q[0] * np.array([[1.0, share], [share, share]])
     cov[:, 1, 0] = cov[:, 0, 1]
     return f, cov, np.array([1.0, -1.0])
-
-
-def _fit_terms(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
-               begun: bool) -> GaussianFit:
-    """Fit by scoring, without the lines if there are more than `_MANY`."""
-    # These lines are fitted with the initial noise and subtracted; after the fit of the rest, all
-    # coefficients of the mean are fitted together.  That suffices, because noise and coefficients
-    # are uncorrelated, and a line depends only on the noise at its own frequency.
-    lines = [k for k, term in enumerate(terms) if isinstance(term, Tone)
-             and term.ROLE is Role.MEAN]
-    if len(lines) <= _MANY:
-        return _maximise(samples, terms, events, rough, begun=begun)
-    first = _with_mean(samples, terms, events)
-    level = sum(samples.columns(term) @ np.array(term.linear_values()) for term in (
-        first.terms[k] for k in lines))
-    others = tuple(term for k, term in enumerate(first.terms) if k not in lines)
-    rest = _maximise(samples.part(slice(None), samples.voltage - level), others, events, rough,
-                     begun=begun)
-    found, errors = iter(rest.terms), iter(rest.se or [{} for _ in others])
-    last = _with_mean(samples, tuple(
-        term if k in lines else next(found) for k, term in enumerate(first.terms)), events)
-    se = tuple({} if k in lines else next(errors) for k in range(len(terms)))
-    return replace(last, se=se, cost=first.cost + rest.cost + last.cost)
 
 
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
@@ -346,7 +316,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
             step = np.clip(step, -1.5, 1.5)
             trial = terms
             for (k, name), by in zip(free, step.tolist(), strict=True):
-                trial = _moved(trial, k, name, by)
+                trial = (*trial[:k], trial[k].moved(name, by), *trial[k + 1:])
             new = _with_mean(samples, trial, events)
             cost += new.cost
             if float(new.density.sum()) > value - 1e-9 * abs(value):
@@ -413,11 +383,6 @@ def _busiest_part(samples: Samples, size: int) -> slice:
     return slice(begin, begin + size)
 
 
-def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term, ...]:
-    changed = terms[k].moved(name, by)
-    return (*terms[:k], changed, *terms[k + 1:])
-
-
 def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
     """Fit the coefficients of the mean by generalised least squares, with known events."""
     run = _filter(samples, terms, events)
@@ -440,13 +405,8 @@ def coefficients(term: Term) -> list[float]:
     return term.linear_values() if term.ROLE is Role.MEAN else []
 
 
-def columns_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return all columns of the mean, as the instrument shows them."""
-    return design_of(samples, terms, s)[:, 1:]
-
-
 def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the voltage and all columns of the mean, cached by terms."""
+    """Return voltage and columns of the mean, as the instrument shows them; cached by terms."""
     means = _means(terms)
     key = tuple(term.with_linear([1.0] * len(term.LINEAR)) for term in means)
     if key not in samples.designs:
@@ -465,12 +425,6 @@ def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray
 
 def _means(terms: Sequence[Term]) -> tuple[Term, ...]:
     return tuple(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou')
-
-
-def mean_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the mean of the voltage, V."""
-    beta = np.array([value for term in terms for value in coefficients(term)])
-    return np.asarray(columns_of(samples, terms, s) @ beta)
 
 
 def owners(terms: Sequence[Term]) -> list[Term | None]:

@@ -322,48 +322,41 @@ def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
     """Return terms fitted to the spectrum of a model's scores, and the gain of the fit, nats."""
     # starts: the initial `ou`, the other terms of `composite` without its laws, then new terms.
     ordinates = Ordinates.of(composite.z[samples.train])
-    spectrum = _Spectrum(samples, composite.gaussian.terms, ordinates.omega)
-    free = [(k, name) for k, term in enumerate(starts) if k == 0 or term.ROLE in (
-        Role.BLOCK, Role.NOISE) for name in term.free()]
-    before = spectrum.of(composite.gaussian.terms)
+    turn = np.exp(1j * ordinates.omega)
+    few = Samples(float(np.median(samples.step[1:])) * np.arange(3.0), np.zeros(3), None)
+    known = composite.gaussian.terms
+    ou = known[0]
+    assert isinstance(ou, OU)
+    # Mean effects of throttle on alpha, sigma and noise.
+    s = driven(samples, known)
+    faster = math.exp(float(np.mean(np.log(s.alpha / ou.alpha))))
+    louder = 1.0 / math.sqrt(float(np.mean((ou.sigma / s.sigma) ** 2)))
+    white = samples.blur + sum(term.variance() for term in known)
+    each = white_noise(samples, known, s)
+    noisier = 1.0 / float(np.mean(white / each)) if white > 0.0 else 1.0
 
-    x, gain = ordinates.climb(
-        lambda x: np.log(spectrum.of(all_moved(starts, free, x)) / before), np.zeros(len(free)))
-    return all_moved(starts, free, x), gain
-
-
-class _Spectrum:
-    """Spectra of models, with the effect of throttle on alpha, sigma and noise."""
-
-    def __init__(self, samples: Samples, terms: Sequence[Term], omega: FloatArray) -> None:
-        self._turn = np.exp(1j * omega)
-        step = float(np.median(samples.step[1:]))
-        self._few = Samples(step * np.arange(3.0), np.zeros(3), None)
-        ou = terms[0]
-        assert isinstance(ou, OU)
-        s = driven(samples, terms)
-        self._faster = math.exp(float(np.mean(np.log(s.alpha / ou.alpha))))
-        self._louder = 1.0 / math.sqrt(float(np.mean((ou.sigma / s.sigma) ** 2)))
-        self._blur = samples.blur
-        noise = samples.blur + sum(term.variance() for term in terms)
-        each = white_noise(samples, terms, s)
-        self._noisier = 1.0 / float(np.mean(noise / each)) if noise > 0.0 else 1.0
-
-    def of(self, terms: Sequence[Term]) -> FloatArray:
+    def spectrum(terms: Sequence[Term]) -> FloatArray:
         """Return the spectrum of a model, up to a factor."""
         ou = terms[0]
         assert isinstance(ou, OU)
-        ou = replace(ou, alpha=ou.alpha * self._faster, sigma=ou.sigma * self._louder)
+        ou = replace(ou, alpha=ou.alpha * faster, sigma=ou.sigma * louder)
         kept = [term for term in terms[1:] if term.ROLE is Role.BLOCK]
-        space = state_space(self._few, [ou, *kept], None)[1]
+        space = state_space(few, [ou, *kept], None)[1]
         f, q, h = space.f[1], space.q[1], space.h
-        left = self._turn[:, None, None] * np.eye(h.size) - f
+        left = turn[:, None, None] * np.eye(h.size) - f
         seen = np.linalg.solve(left.transpose(0, 2, 1), np.broadcast_to(
-            h[:, None], (self._turn.size, h.size, 1)))[..., 0]
-        noise = self._blur + sum(
+            h[:, None], (turn.size, h.size, 1)))[..., 0]
+        noise = samples.blur + sum(
             term.variance() for term in terms[1:] if term.ROLE is Role.NOISE)
         found: FloatArray = np.einsum('ki,ij,kj->k', seen.conj(), q, seen).real
-        return found + noise * self._noisier
+        return found + noise * noisier
+
+    free = [(k, name) for k, term in enumerate(starts) if k == 0 or term.ROLE in (
+        Role.BLOCK, Role.NOISE) for name in term.free()]
+    before = spectrum(known)
+    x, gain = ordinates.climb(
+        lambda x: np.log(spectrum(all_moved(starts, free, x)) / before), np.zeros(len(free)))
+    return all_moved(starts, free, x), gain
 
 
 def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[dict[str, Any], ...]:

@@ -57,11 +57,6 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     return mean, math.sqrt((own + shared) / BLOCKS)
 
 
-def if_known(gain: float, error: float) -> tuple[float, float]:
-    """Return a gain and its error; NaN for both if the error is too large."""
-    return (NAN, NAN) if error > max(_VAGUE * abs(gain), _WIDE) else (gain, error)
-
-
 def without(samples: Samples, model: Composite, *indices: int, plain: Composite | None = None
             ) -> Composite | None:
     """Return the model fitted to everything without some of its terms; None if that fails."""
@@ -115,7 +110,8 @@ def gain_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> tuple[
     both = scored & new.known & old.known
     if int(both.sum()) < BLOCKS:
         return NAN, NAN
-    return if_known(*mean_difference(new.density[both], old.density[both]))
+    gain, error = mean_difference(new.density[both], old.density[both])
+    return (NAN, NAN) if error > max(_VAGUE * abs(gain), _WIDE) else (gain, error)
 
 
 def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> float:

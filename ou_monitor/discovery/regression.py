@@ -28,7 +28,7 @@ from ou_monitor.model.load import INRUSH_TIME, LAGS
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, LONGEST, SHORTEST
 from ou_monitor.model.terms.slow import Drift
-from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term, View
+from ou_monitor.model.terms.term import NEXT_TO_ZERO, Term, View
 from ou_monitor.records import FloatArray
 
 # Number of blocks that are held out in turn.
@@ -71,7 +71,7 @@ class MeanResponse:
 def mean_response(samples: Samples, composite: Composite, view: View,
                   start: Sequence[Term] = ()) -> MeanResponse:
     """Choose the terms of the mean; the other terms of the model stay as they are."""
-    own = [term for term in composite.terms if _measured(term)]
+    own = [term for term in composite.terms if decision.is_response(type(term))]
     pool = [*(term for term in start if not _contains(term, own)), *own]
     # At the start the noise model is rough, and a growing sag would take the place of other terms.
     forms = [form for term in pool if isinstance(term, LoadTransient)
@@ -112,10 +112,6 @@ def _nearby(term: LoadTransient, octaves: float, step: float) -> list[Term]:
             if delay > 0.5 * step]
 
 
-def _measured(term: Term) -> bool:
-    return term.ROLE is Role.MEAN and term.MEASURED
-
-
 def _contains(term: Term, others: Sequence[Term]) -> bool:
     """Return whether a term, or one that is nearly the same, is among others."""
     for other in others:
@@ -141,7 +137,7 @@ def _is_near(one: Term, other: Term) -> bool:
 def _candidates(view: View) -> Iterator[Term]:
     """Yield the candidates of all measured causes of the mean."""
     for kind in catalogue().values():
-        if kind.ROLE is Role.MEAN and kind.MEASURED and (
+        if decision.is_response(kind) and (
                 view.throttle is not None or not kind.NEEDS_THROTTLE):
             yield from kind.candidates(view)
 

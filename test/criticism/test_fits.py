@@ -7,9 +7,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism import structure
 from ou_monitor.criticism.composite import _converged, fit_composite
-from ou_monitor.criticism.curves import bin_width, outline, stray
+from ou_monitor.criticism.curves import outline, stray
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import columns_of, evaluate, Events, solved, state_space
+from ou_monitor.criticism.structure import design_of, evaluate, Events, solved, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.discovery.fitting import from_spectrum, standard_errors
 from ou_monitor.discovery.gain import guess
@@ -189,14 +189,14 @@ def test_the_mean_is_seen_through_the_instrument():
     samples = Samples(t, 5.0 - u, u)
     ou, sag, coupling = OU(60.0, 0.5, 5.0), LoadSag(0.3, 0.1), ACCoupling(2.0, 0.0)
     s = samples.segment(60.0, 0.5)
-    bare = columns_of(samples, (ou, sag), s)
-    shown = columns_of(samples, (ou, sag, coupling), s)
+    bare = design_of(samples, (ou, sag), s)[:, 1:]
+    shown = design_of(samples, (ou, sag, coupling), s)[:, 1:]
     assert bare.shape == shown.shape == (300, 3)
     assert_allclose(shown[:, 0], 1.0)
     assert_allclose(shown[:, 1:], coupling.pass_through(bare[:, 1:], s), atol=1e-12)
     assert np.abs(shown[:90, 1:]).max() < 1e-9 < np.abs(bare[:90, 1:]).min()
     # What is kept from before is not touched.
-    assert_allclose(columns_of(samples, (ou, sag), s), bare)
+    assert_allclose(design_of(samples, (ou, sag), s)[:, 1:], bare)
 
 
 def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_samples():
@@ -251,13 +251,6 @@ def test_events_add_to_the_joint_normal_law():
     # What an event adds at its own sample is not in the variance there.
     own = (power - 1.0) / power * (added - push) + push + error + (white - 1.0) * std**2
     assert_allclose(found.variance, np.diag(known)**2 - own, rtol=1e-3)
-
-
-@pytest.mark.parametrize('n, spread', [(27, 1.0), (1000, 0.02)])
-def test_bins_after_freedman_and_diaconis(n, spread):
-    """2 IQR n^(-1/3): of even values the quartiles are half the range apart."""
-    width = bin_width(np.linspace(5.0, 5.0 + spread, n))
-    assert width == pytest.approx(spread / n ** (1.0 / 3.0))
 
 
 def test_the_outline_of_a_histogram_encloses_the_area_of_its_bars():

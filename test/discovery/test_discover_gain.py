@@ -10,7 +10,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import gain as gains
 from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, blocks_of, cause_gain, covered, held_out, HeldOut, if_known,
+    BLOCKS, blocks_of, cause_gain, covered, gain_of, held_out, HeldOut,
     mean_difference, mean_score, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.load_response import LoadSag
@@ -117,8 +117,9 @@ def test_errors_of_the_mean_are_its_scatter():
     (0.1, 0.02, True)])
 def test_a_gain_with_a_huge_error_is_unknown(gain, error, known):
     """Ten times as large as the gain, and large beside any; small ones are just none."""
-    found = if_known(gain, error)
-    assert found == (gain, error) if known else all(map(math.isnan, found))
+    swing = error * math.sqrt(BLOCKS - 1.0) * (-1.0) ** np.arange(BLOCKS)
+    found = gain_of(held(gain + swing), held(0.0 * swing), np.ones(BLOCKS, bool))
+    assert found == pytest.approx((gain, error) if known else (math.nan, math.nan), nan_ok=True)
 
 
 def held(density, free=2, search=0.0, known=None):
