@@ -164,10 +164,11 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None and (
             k in vague or not decision.improves_predictions(worth.gain, worth.error, worth.chance)
             and not _absorbs_trend(samples, state, k))]
-        if not failing or turn == _ROUNDS - 1:
+        worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
+                 if failing else _cause_of_straying(samples, state))
+        if worst is None or turn == _ROUNDS - 1:
             break
-        _leave_out(state, min(failing, key=lambda k: (
-            -state.worth[k].chance, state.worth[k].gain)))
+        _leave_out(state, worst)
     return state
 
 
@@ -196,6 +197,26 @@ def _leave_out(state: Pruned, worst: int) -> None:
     state.out += [name for name in dict.fromkeys(state.names)
                   if state.names.count(name) > left.count(name)]
     state.names, state.full = left, less
+
+
+def _cause_of_straying(samples: Samples, state: Pruned) -> int | None:
+    """Return the cause, if any, whose removal keeps simulations within the recorded range."""
+    # A term may improve one-step predictions although its simulations exceed the recorded range.
+    # Responses of the mean are not tested.
+    def far_of(model: Composite) -> float:
+        try:
+            return outside_range(samples, model.terms)
+        except ValueError:
+            return math.inf
+
+    far = far_of(state.full.model)
+    if not far > 0.0:
+        return None
+    other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
+             if worth.less is not None and not decision.is_response(catalogue()[state.names[k]])}
+    # The single cause with the least gain; combinations are not tried.
+    return min((k for k, stays in other.items() if not stays > 0.0), default=None,
+               key=lambda k: state.worth[k].gain)
 
 
 def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:

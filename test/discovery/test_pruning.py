@@ -52,6 +52,7 @@ def run(monkeypatch, values, names, vague=()):
     monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
     monkeypatch.setattr(pruning, '_undetermined', lambda samples, state: [
         k for k, name in enumerate(state.names) if name in vague])
+    monkeypatch.setattr(pruning, '_cause_of_straying', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_absorbs_trend', lambda *given: False)
 
     def measure(samples, state, plain, scored, progress):
@@ -106,3 +107,30 @@ def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, mon
     assert said in text and bool(text) is bool(said)
     if gain > 0.0:
         assert 'errors' in refusal(None, (BASE,), gain, 0.01, larger=True)
+
+
+@pytest.mark.parametrize('full, less, gains, out', [
+    (0.0, (0.0, 0.0), (0.1, 0.2), None), (1.0, (0.0, 1.0), (0.2, 0.1), 0),
+    (1.0, (1.0, 0.0), (0.1, 0.2), 1), (1.0, (0.0, 0.0), (0.2, 0.1), 1),
+    (1.0, (2.0, 0.5), (0.1, 0.2), None)])
+def test_the_cheapest_cause_of_strays_is_found(full, less, gains, out, monkeypatch):
+    """Of those without which they stay within what was seen, the one that costs least."""
+    state = state_of('tone', 'measurement_noise')
+    state.worth = [Worth(gain, 0.01, 0.0, 1, worth.less)
+                   for gain, worth in zip(gains, state.worth)]
+    far = {state.full.model.terms: full,
+           **{worth.less.model.terms: by for worth, by in zip(state.worth, less)}}
+    monkeypatch.setattr(pruning, 'outside_range', lambda samples, terms: far[terms])
+    assert pruning._cause_of_straying(None, state) == out
+
+
+def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
+    """An answer of the mean is never the one that is left out for it."""
+    def far(samples, terms):
+        if any(term.NAME == 'tone' for term in terms):
+            raise ValueError('runs away')
+        return 0.0
+
+    monkeypatch.setattr(pruning, 'outside_range', far)
+    assert pruning._cause_of_straying(None, state_of('drift', 'tone')) == 1
+    assert pruning._cause_of_straying(None, state_of('drift')) is None
