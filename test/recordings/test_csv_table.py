@@ -76,6 +76,8 @@ def test_a_current_that_most_voltages_lack_is_held(tmp_path, blank, held):
      [':5:', 'whole lines', 'close each quote']),
     ('time_s,voltage_v,note\n0,5,a\n1,5,"b"\n2,5,"c"d\n', [':4:', "expected after '"]),
     ('time_s,voltage_v,note\n0,5,a\n1,5,"b\n2,5', [':4:', 'end of data', 'close each quote']),
+    ('"time_s,voltage_v,note\n' + ''.join(f'{k},5.{k},n\n' for k in range(9)),
+     [':1:', "no column 'voltage_v'"]),
     ('time_s,voltage_v\n0,5\n1,5_01\n', [':3:', "'5_01'", 'not a number']),
     ('time_s,voltage_v\n0,5\n1,\u0665\n', [':3:', 'not a number']),
     ('time_s,voltage_v\n', ['no usable sample']),

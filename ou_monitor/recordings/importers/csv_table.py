@@ -485,8 +485,9 @@ def _parts_of_second(form: Form, clock: int) -> FileColumn | None:
 
 def _nameless_columns(form: Form) -> list[int]:
     """Return the columns of numbers; with a header, those that may be a voltage."""
-    filled = [k for k in range(form.width) if form.rows and len(form.cells(k)) == len(
-        form.rows) and all(map(is_value, form.cells(k)))]
+    # An open quote makes one name of a line of names.
+    filled = [k for k in range(min(form.width, len(form.names) or form.width)) if form.rows
+              and len(form.cells(k)) == len(form.rows) and all(map(is_value, form.cells(k)))]
     if not form.line:
         return filled
     # A column with a general name, if the time is the only other column; or a steady column with
