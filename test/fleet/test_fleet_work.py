@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 import resource
 import signal
+import time
 from types import SimpleNamespace
 
 from made_logs import crazyflie, hover
@@ -28,6 +29,10 @@ def deadly(task: int, folder: str) -> dict:
     mark = Path(folder) / f'tried_{task}_{os.getpid()}'
     mark.touch()
     tries = len(list(Path(folder).glob(f'tried_{task}_*')))
+    # If task 3 died before task 5 had begun, task 5 would die for the first time when it is alone.
+    end = time.monotonic() + 60.0
+    while task == 3 and not list(Path(folder).glob('tried_5_*')) and time.monotonic() < end:
+        time.sleep(0.01)
     if task == 3 or (task == 5 and tries == 1):
         os.kill(os.getpid(), signal.SIGKILL)
     return {'task': task, 'threads': {name: os.environ.get(name) for name in (
