@@ -23,7 +23,7 @@ from ou_monitor.discovery.gain import (
     without)
 from ou_monitor.discovery.load_effects import load_fall, low_dips
 from ou_monitor.discovery.named import (
-    Named, named_causes, prune_by_gain, Pruned, refusal, Result)
+    FittedSearch, Named, named_causes, prune_by_gain, Pruned, refusal)
 from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
@@ -192,7 +192,7 @@ def _within_codes(samples: Samples, state: Integrity, start: Composite
     return inside, start
 
 
-def _fit_to_codes(samples: Samples, state: Integrity, found: Result
+def _fit_to_codes(samples: Samples, state: Integrity, found: FittedSearch
                   ) -> tuple[Composite, list[str]]:
     """Fit the named model to the codes; return it and its causes, without terms that fail."""
     steps = [term for term in state.exact if term.ROLE is Role.NOISE]

@@ -37,7 +37,7 @@ STOPPED = ('The search for causes was cut short because the next ones would have
 
 
 @dataclass(frozen=True)
-class Result:
+class FittedSearch:
     """A search, its model fitted to everything, and the statistics of that model."""
 
     search: Search
@@ -49,7 +49,7 @@ class Result:
 class Named:
     """Result of all searches."""
 
-    found: Result
+    found: FittedSearch
     bank: NullBank  # Calibration of the statistics
     dropped: tuple[str, ...]  # Causes that were withdrawn
     before: Mapping[str, float]  # Statistics of the plain model
@@ -63,7 +63,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     before = criticise(samples, start, bank)
     fitter = Fitter(samples, start.cost)
     search = Search(fitter.fit(start.terms, start) or start)
-    found = Result(search.copy(), start, before)
+    found = FittedSearch(search.copy(), start, before)
     given = [term.NAME for term in exact]
     failure, begun = '', None
     dropped: list[str] = []
@@ -105,13 +105,13 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                  before, failure or (STOPPED if search.stopped else ''))
 
 
-def _fit_everything(fitter: Fitter, search: Search, bank: NullBank) -> Result:
+def _fit_everything(fitter: Fitter, search: Search, bank: NullBank) -> FittedSearch:
     """Return a search with its model fitted to everything, held-out events included."""
     whole = fitter.whole(search.composite)
-    return Result(search.copy(), whole, criticise(fitter.samples, whole, bank))
+    return FittedSearch(search.copy(), whole, criticise(fitter.samples, whole, bank))
 
 
-def _withdrawn(fitter: Fitter, found: Result, begun: Result) -> list[int]:
+def _withdrawn(fitter: Fitter, found: FittedSearch, begun: FittedSearch) -> list[int]:
     """Return the causes that do not explain their statistics, or no longer fit their name."""
     names = found.search.accepted
     kinds = [catalogue()[name] for name in names]

@@ -283,9 +283,11 @@ _SLOW = 1.0
 
 def under_load(fitter: Fitter, search: Search) -> None:
     """Start from the load model: response to throttle, and noise that follows it, together."""
-    found = [search.copy() for _ in STARTS]
-    for one, lags in zip(found, STARTS):
-        _from_load(fitter, one, load_terms(fitter.samples, lags))
+    # Without throttle, or in a short recording, the starts may be equal.
+    loads = dict.fromkeys(load_terms(fitter.samples, lags) for lags in STARTS)
+    found = [search.copy() for _ in loads]
+    for one, load in zip(found, loads):
+        _from_load(fitter, one, load)
     best = max(found, key=lambda one: fitter.evidence(one.composite))
     search.composite, search.accepted, search.rivals = best.composite, best.accepted, best.rivals
 

@@ -154,7 +154,7 @@ def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
                         search.accepted.append('drift'))
     monkeypatch.setattr(rules_of_names, 'name_causes', add)
     monkeypatch.setattr(rules_of_names, '_fit_everything', lambda fitter, search, bank:
-                        rules_of_names.Result(search.copy(), search.composite, {}))
+                        rules_of_names.FittedSearch(search.copy(), search.composite, {}))
     monkeypatch.setattr(rules_of_names, '_withdrawn', lambda fitter, found, begun: [
         k for k, name in enumerate(found.search.accepted) if name == NOISE.NAME])
     monkeypatch.setattr(rules_of_names, 'without_causes', lambda fitter, search, out: replace(
