@@ -15,6 +15,7 @@ from ou_monitor.cli import output
 from ou_monitor.cli.arguments import check_ranges, columns_given
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
+from ou_monitor.text import counted
 
 if TYPE_CHECKING:
     from ou_monitor.fleet.analysis import Options
@@ -61,9 +62,10 @@ def run(args: argparse.Namespace) -> int:
               'resumes', file=sys.stderr)
         raise
     _write(fleet, folder, args)
-    if not fleet.analysed:
-        raise InputError('none of the recordings could be analysed; the reasons are in '
-                         f"'{folder}' and in the column error of the table")
+    if fleet.failed:
+        raise InputError(f'{len(fleet.failed)} of {counted(fleet.recordings, "recording")} could '
+                         f"not be analysed; the reasons are in '{folder}' and in the column error "
+                         'of the table')
     return 0
 
 
