@@ -416,11 +416,12 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         flown = supplied(readings_of(_read(recording)))
         if wrong := faults(flown):
             raise InputError(f'{flown.name}: {wrong[0].text}')
-        load = ''
-        if not flown.has_throttle and flown.current is not None and (
+        tried = [(flown, '')]
+        if flown.current is not None and (
                 most := float(np.fmax.reduce(np.abs(flown.current), initial=0.0))) > 0.0:
-            flown = replace(flown, throttle=np.abs(flown.current) / most)
-            load = f' Throttle is the measured current divided by its maximum, {number(most)} A.'
+            tried = [*(tried if flown.has_throttle else ()), (
+                replace(flown, throttle=np.abs(flown.current) / most),
+                f' Throttle is the measured current divided by its maximum, {number(most)} A.')]
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells, origin = (values['cells'], 'given') if 'cells' in values else cells_of(flown)
         values['cells'] = cells
@@ -442,8 +443,14 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
                 source += (f', {counted(cells, "cell")} guessed from the voltage: --cells N '
                            'overrides it; for a rail or lead-acid, give --set cells=0 and '
                            '--brownout-voltage V')
-        flight, facts, risk_of = _flight(
-            flown, full, cells, level if rail == 'bus' else None, horizon, risk)
+        for one, load in tried:
+            flight, facts, risk_of = _flight(
+                one, full, cells, level if rail == 'bus' else None, horizon, risk)
+            sag, se = flight.sag_at(flight.flown[1])
+            # As in analyze: the load is the current if no sag over throttle is measurable.
+            if facts.sag.known and sag > 2.0 * se or not flight.resistance > 0.0:
+                break
+        assert facts is not None
         if load and not flight.resistance > 0.0:
             flight = replace(flight, resistance=float(flight.sag[-1]) / most)
         if not facts.sag.known and 'battery_resistance' not in values:
@@ -457,8 +464,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
         share = circuit.battery_resistance / flight.resistance if flight.resistance > 0.0 else 1.0
         taken = taken_words(flight, circuit, throttle, assumed, origin) + load
-        error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
-            throttle, flight.throttle, flight.sag))
+        sag, se = flight.sag_at(throttle)
+        error = se / sag
         if risk_of is not None and not values.keys() & SHOWN and facts.budget is not None and (
                 math.isfinite(facts.budget.throttle)):
             known = partial(risk_of, share=share, rise=circuit.battery_voltage - flight.level)

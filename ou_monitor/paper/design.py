@@ -131,7 +131,8 @@ class Design:
     esr_follows: bool  # Whether ESR falls as 1/C (capacitors in parallel).
     verdict: DesignVerdict  # Verdict.
     present: DesignRow  # With the present capacitor.
-    # With the smallest capacitance above which every capacitance meets the target; None: none.
+    # With the smallest capacitance above which every capacitance meets the target; None: none
+    # does, or all do and the present one too.
     least: DesignRow | None
     doubled: DesignRow  # With twice the present capacitance.
     rows: tuple[DesignRow, ...]  # One row for each capacitance tried, rising.
@@ -246,6 +247,9 @@ def design(
         least = _least(at, rows, float(_rate_of(np.array(risk), horizon)))
         verdict = (DesignVerdict.ENOUGH if present.risk <= risk else
                    DesignVerdict.FOUND if least is not None else DesignVerdict.OUT_OF_RANGE)
+        if verdict is DesignVerdict.ENOUGH and least is rows[0]:
+            # The end of the range is not a minimum.
+            least = None
     risks = [row.risk for row in rows]
     found = Design(
         network=network, rail=rail, throttle=throttle, voltage=voltage, horizon=horizon,
@@ -354,7 +358,9 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
 def answer(result: Design) -> str:
     present, least = result.present, result.least
     if result.verdict is DesignVerdict.ENOUGH:
-        also = '' if least is None else f' {_uf(least)} or more meets the target.'
+        also = f' {_uf(least)} or more meets the target.' if least is not None else (
+            f' So does any from {_uf(result.rows[0])} to {_uf(result.rows[-1])}.'
+            if result.rows[-1].risk <= result.target else '')
         return (f'No more capacitance is needed: with the present {_uf(present)} the risk is '
                 f'{probability(present.risk)}.{also}')
     if result.verdict is DesignVerdict.FOUND:
@@ -450,6 +456,11 @@ class Flight:
     alpha: float  # Relaxation rate of the OU, 1/s
     var_inf: float  # Variance of the OU, V^2
 
+    def sag_at(self, throttle: float) -> tuple[float, float]:
+        """Return the sag at a throttle and its standard error, V."""
+        return (float(np.interp(throttle, self.throttle, self.sag)),
+                float(np.interp(throttle, self.throttle, self.sag_se)))
+
 
 # Components that, if given, replace the load of a flight, so the flight's risk does not apply.
 SHOWN = frozenset(('current_max', 'current_exponent', 'switching_scale', 'flutter'))
@@ -459,7 +470,7 @@ def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerN
     """Return the network of a flight, with values `given` in place of measured ones."""
     low, high = flight.flown
     u, sag = np.asarray(flight.throttle), np.asarray(flight.sag)
-    at = float(np.interp(throttle, u, sag))
+    at, _ = flight.sag_at(throttle)
     rms, steady = (float(np.interp(throttle, u, np.asarray(one)))
                    for one in (flight.noise, flight.steady))
     if not (math.isfinite(flight.level) and math.isfinite(at) and at > 0.0):

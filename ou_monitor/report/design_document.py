@@ -82,8 +82,7 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
         'taken as a rail, whose regulator is a constant voltage behind a resistance')
     regulator = '' if network.regulator_voltage else (
         ' Regulators on this supply are left out: the recorded voltage includes their effect.')
-    sag, se = (float(np.interp(throttle, flight.throttle, one))
-               for one in (flight.sag, flight.sag_se))
+    sag, se = flight.sag_at(throttle)
     changed = '' if math.isclose(network.battery_voltage, flight.level) else (
         f'; changed to {network.battery_voltage:.4g} V')
     return (f'From the recording: {flight.level:.4g} V without load at its end (by the load model'

@@ -224,7 +224,7 @@ def test_a_recorded_rail_is_the_source(volts, level, said, tmp_path, capsys):
 
 
 def test_a_measured_current_is_the_load(tmp_path, capsys):
-    """A rail of 0.1 Ohm without a throttle: the answer is that of the current as throttle."""
+    """A rail of 0.1 Ohm, without throttle or with a flag that explains nothing."""
     rng = np.random.default_rng(2)
     amps = np.repeat(2.0 * rng.uniform(0.0, 1.0, 80), 50)
     path = write_csv(tmp_path / 'rail.csv', np.arange(amps.size) / 50.0, 5.0 - 0.1 * amps
@@ -236,6 +236,12 @@ def test_a_measured_current_is_the_load(tmp_path, capsys):
         0.1 * amps.max() * found['throttle'], rel=0.1)
     assert 'no throttle and no current' in failure(
         capsys, 'design', '--from', path, '--current-column', 'none')
+    flag = write_csv(tmp_path / 'flag.csv', *np.loadtxt(
+        path, delimiter=',', skiprows=1, unpack=True)[:2], np.repeat(
+            rng.uniform(size=20) > 0.5, 200).astype(float), current=amps)
+    other = asked(capsys, '--from', flag)
+    assert other['measured'][-80:] == found['measured'][-80:]
+    assert other['present']['sag'] == pytest.approx(found['present']['sag'], rel=0.01)
 
 
 def test_the_sag_of_a_small_pack_is_the_recorded_one(tmp_path, capsys):
