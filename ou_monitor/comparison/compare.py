@@ -352,8 +352,7 @@ def _lasting_line(rest: FloatArray, rate: float) -> Line | None:
 
 def _level_words(bias: Sequence[float], volts: float) -> str:
     first, *_, last = bias
-    more = (f' ({_off(first)} in the first third, {_off(last)} in the last: it falls '
-            f'{"less" if last > first else "more"} with time than the recording)'
+    more = (f' ({_off(first)} in the first third, {_off(last)} in the last)'
             if abs(last - first) > max(volts, abs(first)) else '')
     return f'the voltage is on average {_off(float(np.mean(bias)))}{more}'
 

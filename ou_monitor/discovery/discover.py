@@ -46,8 +46,6 @@ _REDRAWN = 3
 # Number of these alternations that also choose the terms of the load: first from the codes, then
 # from readings drawn within the codes.
 _SEARCHED = 2
-# Maximum sampling step, in relaxation times, that still shows the relaxation.
-_BLIND = 1.0
 
 
 def discover(recording: Recording, *, seed: int = 0,
@@ -285,8 +283,9 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     ou = model.terms[0]
     assert isinstance(ou, OU)
     step = float(np.median(samples.step[1:]))
-    if ou.alpha * step > _BLIND:
-        notes.append(no_relaxation_note(ou.alpha, step))
+    # Whether chance alone makes the correlation between samples as large.
+    if math.exp(-ou.alpha * step) < Z95 / math.sqrt(samples.n):
+        notes.append(no_relaxation_note(step))
     elif relaxes(ou.alpha, duration) and not any(
             model.has(name) for name in ('ac_coupling', 'load_sag', 'drift')):
         # A lasting sag or drift would rule out an AC coupling.

@@ -166,11 +166,10 @@ def coupling_note(alpha: float, duration: float, n: int) -> str:
             f'{number(alpha / (2.0 * math.pi))} Hz); a DC-coupled recording would settle it.')
 
 
-def no_relaxation_note(alpha: float, step: float) -> str:
-    """Return the note for samples farther apart than the relaxation time."""
+def no_relaxation_note(step: float) -> str:
+    """Return the note for samples too far apart, s, to show the relaxation."""
     return (f'Samples {number(1e3 * step)} ms apart are nearly uncorrelated: the rail is faster '
-            f'than the sampling, or the noise comes from the sensor; alpha = {number(alpha)} 1/s '
-            'is only a lower bound.')
+            'than the sampling, or the noise comes from the sensor.')
 
 
 def remaining_words(left: Sequence[Criticism]) -> str:

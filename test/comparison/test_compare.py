@@ -138,7 +138,7 @@ def test_a_faster_discharge_is_the_cause_of_lower_dips():
     one = drawn(3)
     found = compare(replace(one, voltage=one.voltage - one.t / 40.0), model(), seeds=40)
     assert found.farthest == 'level' and not found.lowest.inside
-    assert 'less with time than the recording' in found.words
+    assert 'mV too high in the last)' in found.words
 
 
 @pytest.mark.parametrize('sag', [0.5 * SAG, 2.0 * SAG])

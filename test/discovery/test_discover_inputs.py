@@ -79,7 +79,7 @@ QUIET = {
     'NaN stamps': '429 samples dropped', 'NaN throttle': 'Throttle is unknown at 10 samples',
     'stamps swapped': '99 samples came after', 'stamps decreasing': '2999 samples came after',
     'inf': '3 samples dropped', 'huge unit': '', 'tiny noise': '', 'epoch': '',
-    'white': 'only a lower bound'}
+    'white': 'nearly uncorrelated'}
 
 
 @pytest.mark.parametrize('what', sorted(QUIET))
@@ -94,6 +94,13 @@ def test_defects_are_notes_and_name_no_cause(what):
     json.dumps(data, allow_nan=False)
     assert data['baseline']['params']['alpha'] > 0.0 and math.isfinite(found.gain)
     assert data['duration_s'] > 0.0
+
+
+def test_a_relaxation_within_a_step_may_still_show():
+    """Where neighbours 1.6 relaxation times apart are correlated, alpha is known."""
+    found = discover(Recording(*simulated(ou=OU(1600.0, 1.6, 5.0)), 'fast'))
+    assert found.baseline.alpha == pytest.approx(1600.0, rel=0.25)
+    assert not any('uncorrelated' in note for note in found.notes)
 
 
 def test_a_rail_is_the_same_in_any_unit_and_era():

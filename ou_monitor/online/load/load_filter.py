@@ -512,11 +512,12 @@ class LoadFilter:
         swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
         most = _NOISE_SHARE * math.exp(0.5 * (b[0] + b[1] * ripple(0.5 * (low + high))))
         limit = max(_SAG_SHARE * swing, most)
-        if swing < -2.0 * swing_se or swing_se < limit and swing < 2.0 * swing_se:
-            return LoadStatus.NO_RELATION, most
+        if swing < -2.0 * swing_se:
+            return LoadStatus.RISES, most
         if swing_se >= limit:
             return LoadStatus.UNCERTAIN, most
-        return (LoadStatus.NO_RELATION if self._delay.unrelated else LoadStatus.KNOWN), most
+        return (LoadStatus.NO_RELATION if swing < 2.0 * swing_se or self._delay.unrelated else
+                LoadStatus.KNOWN), most
 
     @property
     def _level(self) -> float:

@@ -70,6 +70,7 @@ class LoadStatus(enum.Enum):
                    'under load.')
     STILL = 'Throttle has moved by less than 2 %: too little for a sag over throttle.'
     UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
+    RISES = 'The voltage rises with throttle: check topic, unit and sign of throttle.'
     NO_RELATION = ('The voltage does not fall with throttle, as on a regulated rail; on a '
                    'battery, check topic, unit and sign of throttle.')
 
@@ -151,7 +152,7 @@ class SupplyLoad:
 
     def _read(self, throttle: npt.ArrayLike, table: tuple[float, ...]) -> FloatArray:
         u = np.asarray(throttle, dtype=np.float64)
-        if not table or self.status is LoadStatus.STILL:
+        if not table or self.status in (LoadStatus.STILL, LoadStatus.RISES):
             return np.full(u.shape, NAN)
         return np.asarray(np.interp(u, TABLE, table))
 

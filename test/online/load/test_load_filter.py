@@ -140,9 +140,10 @@ def test_throttle_of_another_vehicle_is_no_relation(seed):
     assert not loaded(t, v, u).known
 
 
-def test_throttle_of_the_wrong_sign_is_no_relation():
+def test_a_voltage_that_rises_with_throttle_has_no_sag():
     t, v, u = flight(60.0)
-    assert loaded(t, v, 1.0 - u).status is LoadStatus.NO_RELATION
+    load = loaded(t, v, 1.0 - u)
+    assert load.status is LoadStatus.RISES and np.isnan([load.sag(1.0), load.sag_se(1.0)]).all()
 
 
 def test_throttle_that_is_not_repeated_holds():
