@@ -8,7 +8,7 @@ two of the median of the class; it does not mean safe.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 import math
 import re
@@ -18,6 +18,7 @@ import numpy as np
 from ou_monitor.analysis.noise import flown_near
 from ou_monitor.analysis.supply import SupplyFacts
 from ou_monitor.errors import InputError
+from ou_monitor.model.load import FULL_CELL
 from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import NAN, plain_data, Recording
 from ou_monitor.text import counted, number
@@ -34,8 +35,8 @@ HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
 _PACK = 3.5
 # Maximum number of cells that is guessed: 100 V, the limit of common high-voltage ESCs.
 _MOST_GUESSED = 24
-# Cell voltage at rest that a guess prefers, V: between full (4.2) and half full (3.8).
-_HALF = 4.0
+# Lowest usual voltage of a cell at rest, V: half full.
+_HALF = 3.8
 # Cells of common LiFePO4 packs, and the plateau of such a cell at rest, V.
 _IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
@@ -131,18 +132,24 @@ def full_voltage(recording: Recording) -> float:
     return float(np.median(whole, axis=1).max())
 
 
-def cell_count(full: float) -> int:
-    """Return the most likely number of cells with this voltage at rest, V; 0 if implausible."""
-    if not (math.isfinite(full) and full > 0.0):
-        return 0
-    least = math.ceil(full / HIGHEST_CELL)
-    likely = range(least, min(int(full / _PACK), _MOST_GUESSED) + 1)
-    return min(likely, key=lambda cells: abs(full / cells - _HALF), default=0)
+def _usual_cells(full: float) -> tuple[int, ...]:
+    """Return the numbers of cells that are full to half full at this voltage at rest, V."""
+    return tuple(n for n in range(1, _MOST_GUESSED + 1) if _HALF <= full / n <= FULL_CELL)
 
 
-def fits(full: float, cells: int) -> bool:
-    """Return whether a pack of this number of cells can start a flight with this voltage, V."""
-    return _BEGINS <= full / cells <= HIGHEST_CELL
+def likely_cells(full: float) -> tuple[int, ...]:
+    """Return the numbers of cells that a voltage at rest, V, cannot tell apart."""
+    return _usual_cells(full) or tuple(sorted(
+        (n for n in range(1, _MOST_GUESSED + 1) if _PACK <= full / n <= HIGHEST_CELL),
+        key=lambda n: abs(full / n - 0.5 * (_HALF + FULL_CELL)))[:1])
+
+
+def cells_among(full: float, known: Iterable[int]) -> int:
+    """Return which number of a vehicle's flights one with this voltage at rest has; 0: unknown."""
+    # A flight that ends an empty pack begins below any usual voltage.
+    usual = bool(_usual_cells(full))
+    fit = [n for n in known if (_PACK if usual else _BEGINS) <= full / n <= HIGHEST_CELL]
+    return 0 if usual and len(fit) > 1 else max(fit, default=0)
 
 
 def check_cells(full: float, cells: int) -> None:
@@ -151,19 +158,23 @@ def check_cells(full: float, cells: int) -> None:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: '
             + ('the voltage seems to be in mV or counts (--unit mV)' if full > MOST_SUPPLY else
-               f'it is likely {counted(likely, "cell")} (lithium)' if (likely := cell_count(full))
-               else 'no number of charged lithium cells fits')
+               f'it is likely {_either(likely)} (lithium)' if (likely := likely_cells(full)) else
+               'no number of charged lithium cells fits')
             + '; for lead-acid, or a rail that is not a pack, leave --cells out and give '
             '--brownout-voltage V')
 
 
 def doubtful_cells(full: float, cells: int) -> str:
     """Return a warning if this number of cells hardly fits the voltage at rest, V; else ''."""
-    likely = cell_count(full)
-    low = 0 < likely < cells and full / cells < _PACK
+    likely = likely_cells(full)
+    low = 0 < max(likely, default=0) < cells and full / cells < _PACK
     return '' if not low or cells == _iron_cells(full) else (
         f'{full:.4g} V at rest would be {full / cells:.3g} V per cell: the pack is empty or '
-        f'damaged, or it has {counted(likely, "cell")}, not {cells}.')
+        f'damaged, or it has {_either(likely)}, not {cells}.')
+
+
+def _either(cells: tuple[int, ...]) -> str:
+    return ' or '.join(map(str, (*cells[:-1], counted(cells[-1], 'cell'))))
 
 
 def _iron_cells(full: float) -> int:
@@ -186,8 +197,9 @@ def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:
     """Return the cells in series and their source: given, log, guessed or unknown."""
     if given:
         return given, 'given'
-    guess = cell_count(full_voltage(recording))
-    return stated_cells(recording.source) or (guess, 'guessed' if guess else 'unknown')
+    likely = likely_cells(full_voltage(recording))
+    return stated_cells(recording.source) or (
+        (likely[0], 'guessed') if len(likely) == 1 else (0, 'unknown'))
 
 
 def stated_cells(source: Mapping[str, str]) -> tuple[int, str] | None:
@@ -259,6 +271,9 @@ def craft_line(craft: Craft) -> str:
             found.setdefault(one.kind, []).append(
                 f'{one.name} {number(1e3 * one.value)} {_UNITS[one.name]} is {one.verdict}'
                 + ('' if one.verdict == 'usual' else f' (usual: {low} to {high})'))
+    likely = likely_cells(craft.full_v)
+    if not craft.cells and likely:
+        return f'if it is a pack: {_either(likely)} of LiPo; give --cells N'
     if not found and (craft.measures or not craft.cells):
         return ''
     iron = _iron_cells(craft.full_v)

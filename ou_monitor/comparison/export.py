@@ -89,7 +89,8 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         () if math.isinf(n.drain) else (Drift((n.empty - n.full) / n.drain, 0.0),)), *(
         t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))),
         full_current=model.full_current)
-    notes = _omitted_terms(model, target, throttle, rate)
+    notes = [*_omitted_terms(model, target, throttle, rate),
+             f'the number of cells, {n.cells}, is a guess from the voltage']
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is the sag under the usual load, {n.usual_sag:.3g} V: throttle '
                      'does not change it')

@@ -17,7 +17,7 @@ import re
 from tempfile import TemporaryFile
 from typing import Any
 
-from ou_monitor.analysis.crafts import fits
+from ou_monitor.analysis.crafts import cells_among
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, FoundRecording, SearchResult
@@ -191,7 +191,7 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
     more += [f'{vehicles[path].name or "unknown vehicle"}: {path.name}: {note}' for path in starts
              for note in results[path]['damage']]
     for group in {v.name for v in vehicles.values()} - {''}:
-        _raise_guesses([results[path] for path in starts if vehicles[path].name == group])
+        _guess_together([results[path] for path in starts if vehicles[path].name == group])
     rows = [row for source in sources for row in rows_of(
         source, whole[source.path], vehicles[source.path], flights.get(source.path),
         twice.get(source.path))]
@@ -200,10 +200,10 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
     return rows, [*notes, *more]
 
 
-def _raise_guesses(flights: Sequence[dict[str, Any]]) -> None:
-    """Replace guessed or unknown cells by the vehicle's largest number that fits the voltage."""
-    known = sorted({one['cells'] for one in flights if one['cells']}, reverse=True)
+def _guess_together(flights: Sequence[dict[str, Any]]) -> None:
+    """Replace guessed or unknown cells by those that a vehicle's flights allow."""
+    known = {one['cells'] for one in flights if one['cells']}
     for one in flights:
-        found = next((cells for cells in known if fits(one['full_v'], cells)), 0)
-        if one['cells_from'] in ('guessed', 'unknown') and found:
-            one.update(cells=found, cells_from='guessed')
+        if one['cells_from'] in ('guessed', 'unknown'):
+            cells = cells_among(one['full_v'], known)
+            one.update(cells=cells or None, cells_from='guessed' if cells else 'unknown')

@@ -85,8 +85,8 @@ COLUMNS = (
     Column('sag_full', 'number', 'V', 'sag extrapolated to full throttle; recordings are compared '
            'by it'),
     Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
-    Column('cells', 'count', '', 'cells in series; if guessed, the largest guess among the '
-           "vehicle's flights that fits this flight's voltage"),
+    Column('cells', 'count', '', "cells in series; if guessed, by the voltages of the vehicle's "
+           'flights; null if several numbers are possible'),
     Column('cells_from', 'text', '', 'origin of the cells: given, log, guessed (by the voltage), '
            'unknown'),
     Column('resistance', 'number', 'Ohm', 'resistance of the whole pack after a second, as in '

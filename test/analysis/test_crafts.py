@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 from ou_monitor.analysis.crafts import (
-    _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, doubtful_cells, KNOWN,
+    _measure, cells_of, craft_advice, craft_line, craft_of, doubtful_cells, KNOWN, likely_cells,
     MICRO, QUAD, ROBOT, stated_limit)
 from ou_monitor.analysis.overview import answers, overview
 from ou_monitor.analysis.supply import supply_facts
@@ -29,8 +29,14 @@ def flown(cells=4, sag=0.6, noise=0.08, source=None, n=1500):
     (3.31, 0), (5.0, 0), (6.05, 0), (9.1, 0), (10.1, 0), (12.0, 3), (100.8, 24), (400.0, 0),
     (16500.0, 0)])
 def test_cells_are_guessed_by_the_voltage(volts, cells):
-    """Those nearest to 4 V that no charger overfills; most rails are no packs, but 12 V may be."""
-    assert cell_count(volts) == cells
+    """Those of 3.8 to 4.25 V, else near it; most rails are no packs, but 12 V may be."""
+    assert likely_cells(volts) == ((cells,) if cells else ())
+
+
+def test_cells_that_the_voltage_cannot_tell_are_unknown():
+    wheel = replace(flown(cells=16), throttle=None)
+    assert likely_cells(67.2) == (16, 17) and cells_of(wheel) == (0, 'unknown')
+    assert '16 or 17 cells' in craft_line(craft_of(wheel, supply_facts(wheel)))
 
 
 def test_given_cells_override_the_log_and_the_log_the_guess():
@@ -100,7 +106,7 @@ def test_values_are_called_usual_high_or_low():
             assert f'is {verdict}' in craft_line(known) and not craft_advice(craft)
             assert [found[name].remedy in said for said in craft_advice(known)] == (
                 [True] if verdict == 'high' else [])
-    for cells in (7, 16):
+    for cells in (7, 10):
         wheel = flown(cells=cells)
         craft = craft_of(wheel, supply_facts(wheel))
         assert craft.measures == () and 'no class known' in craft_line(craft)

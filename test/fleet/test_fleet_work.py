@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 from made_logs import crazyflie, hover
 import numpy as np
-from ou_monitor.analysis.crafts import cell_count
+from ou_monitor.analysis.crafts import likely_cells
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.fleet import _raise_guesses, SavedResults
+from ou_monitor.fleet.fleet import _guess_together, SavedResults
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern, start_of
 from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
@@ -321,13 +321,14 @@ def test_a_recording_whose_voltage_means_nothing_is_left_out(tmp_path, factor, w
         assert why in work(str(path), Options(cells=cells))['error']
 
 
-@pytest.mark.parametrize('full, cells', [(13.6, 4), (13.2, 4), (5.1, 0)])
-def test_a_discharged_pack_has_the_cells_of_its_vehicle(full, cells):
-    """Alone, 13.6 V fits no charged pack, and 13.2 V three cells; 5.1 V is another supply."""
-    guess = cell_count(full)
-    flights = [{'cells': 4, 'cells_from': 'guessed', 'full_v': 16.6},
-               {'cells': guess or None, 'cells_from': 'guessed' if guess else 'unknown',
-                'full_v': full}]
-    _raise_guesses(flights)
-    assert guess != 4 and (flights[1]['cells'] or 0) == cells
-    assert flights[1]['cells_from'] == ('guessed' if cells else 'unknown')
+@pytest.mark.parametrize('full, others, cells', [
+    (13.6, (4,), 4), (13.2, (4,), 4), (5.1, (4,), 0), (12.6, (4,), 3), (16.8, (5,), 4),
+    (21.2, (6,), 0), (66.0, (), 0), (66.0, (16,), 16), (66.0, (16, 17), 0)])
+def test_a_pack_has_the_cells_that_its_vehicle_allows(full, others, cells):
+    """13.2 V is four empty cells rather than three overfull ones; 21.2 V may be 5 or 6."""
+    guess = likely_cells(full)
+    one = {'cells': guess[0] if len(guess) == 1 else None, 'full_v': full,
+           'cells_from': 'guessed' if len(guess) == 1 else 'unknown'}
+    _guess_together([one, *({'cells': n, 'cells_from': 'log', 'full_v': 4.1 * n}
+                            for n in others)])
+    assert (one['cells'] or 0, one['cells_from']) == (cells, 'guessed' if cells else 'unknown')
