@@ -26,10 +26,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.noise import (
     dip_begins, noise_of, remainder, rise_that_ends, without_wild)
-from ou_monitor.comparison.flight_model import (
-    file_simulator, fit_flight, FlightModel, MOVES, Readings)
-from ou_monitor.criticism.adc import without_repeats
-from ou_monitor.criticism.curves import stray
+from ou_monitor.comparison.flight_model import file_simulator, fit_flight, MOVES
+from ou_monitor.criticism.adc import find_step, without_repeats
 from ou_monitor.criticism.readings import current_at, on_time, usable, why_no_model
 from ou_monitor.errors import InputError
 from ou_monitor.model.load_fit import LoadInput
@@ -38,6 +36,7 @@ from ou_monitor.model.spectral_lines import find_lines, Line
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, number, percent, Z95
+from ou_monitor.timeline import part_of
 from scipy.signal import welch
 
 
@@ -46,6 +45,19 @@ class Likeness(enum.Enum):
 
     LOOKS_LIKE_IT = 'The simulation looks like the recording'
     DIFFERS = 'The simulation differs from the recording'
+
+
+# Probability of a false `DIFFERS` by the largest score; with n < 49 simulations it is 1 / (n + 1),
+# and the score must exceed all of theirs.
+LEVEL = 0.02
+# Importance for a pilot, relative to the lowest voltage and the number of dips.
+_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'line': 0.8,
+            'spectrum': 0.5, 'ks': 0.5}
+# Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
+# and of a power, and a KS distance.
+_RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
+# Ends of a 95 % band, %.
+BAND = (2.5, 97.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +71,6 @@ class ComparedNumber:
     measured: float  # In the recording
     simulated: FloatArray  # In each simulation; shape (seeds,)
     least: float  # Minimum half-width of the band in which scores are counted
-    template: str  # Wording, with the fields measured, low, median, high and ratio (of powers)
     at: tuple[float, ...] = ()  # Level, V, or frequencies, Hz
     # 2.5 %, 50 % and 97.5 % quantiles of the simulations.
     low: float = field(init=False)
@@ -70,7 +81,7 @@ class ComparedNumber:
         # By this method, 95 % of further simulations lie in low..high; by NumPy's default method,
         # only 91 % do if the band comes from 50 simulations.
         for name, value in zip(('low', 'median', 'high'), np.percentile(
-                self.simulated, [_LOW, 50.0, _HIGH], method='weibull').tolist()):
+                self.simulated, [BAND[0], 50.0, BAND[1]], method='weibull').tolist()):
             object.__setattr__(self, name, value)
 
     @property
@@ -93,13 +104,19 @@ class ComparedNumber:
         return (self.median / self.measured) ** 2 if self.measured > 0.0 else NAN
 
     @property
+    def texts(self) -> list[str]:
+        """Return the unit, the measured number, and low, median and high of the simulations."""
+        # Levels in V, differences in mV.
+        factor, unit = (1e3, 'mV') if (self.unit, self.digits) == ('V', 3) else (1.0, self.unit)
+        return [unit, *(number(factor * x, self.digits)
+                        for x in (self.measured, self.low, self.median, self.high))]
+
+    @property
     def words(self) -> str:
-        """Return the difference as a part of a sentence."""
-        digits = 4 if self.kind == 'lowest' else 2
-        factor = 1e3 if 'mV' in self.template else 1.0
-        return self.template.format(ratio=number(self.power_ratio, 2), **{
-            name: number(factor * getattr(self, name), digits)
-            for name in ('measured', 'low', 'median', 'high')})
+        """Return the number as a part of a sentence."""
+        unit, measured, low, median, high = self.texts
+        return (f'{self.name}, simulated {median} {unit} ({low} to {high}), measured {measured} '
+                f'{unit}').replace('  ', ' ').rstrip()
 
     def as_data(self) -> dict[str, float]:
         """Return the four numbers by name."""
@@ -119,34 +136,15 @@ class ComparedNumber:
         half = np.maximum(np.where(off > 0.0, up, down), self.least)
         return np.asarray(_WEIGHTS[self.kind] * np.abs(off) / half)
 
-    @property
-    def off(self) -> bool:
-        """Return whether the recording lies outside the band, by a difference that matters."""
-        return not self.inside and abs(self.measured - self.median) > self.least
-
 
 @dataclass(frozen=True, eq=False)
-class Traces:
-    """Curves for a page: the part compared, and simulations of it."""
+class Measures:
+    """Measures of one voltage."""
 
-    # The recording: stamps, s, voltage, V, and throttle, 0..1 (NaN: not recorded).
-    t: FloatArray
-    voltage: FloatArray
-    throttle: FloatArray
-    simulated: FloatArray  # One simulation, V
-    # Stamps, s, and the 95 % band of the simulations, V.
-    at: FloatArray
-    low: FloatArray
-    high: FloatArray
-    # Time after a rise of throttle, s, and the mean response to it, V.
-    after: FloatArray
-    response: FloatArray
-    response_low: FloatArray
-    response_high: FloatArray
-    # Voltages, V, and the share of the samples below each.
-    edges: FloatArray
-    distribution: FloatArray
-    simulated_distribution: FloatArray
+    # Numbers of the rows, but the KS distance: V, or dips per minute.
+    numbers: FloatArray
+    response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
+    distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +162,19 @@ class Agreement:
     bias: float
     bias_by_third: tuple[float, ...]  # V
     rows: tuple[ComparedNumber, ...]
-    rises: int  # Rises of throttle
     p_value: float  # Share, of simulations and recording, with at least the recording's score
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
     farthest: str  # Kind of that difference: a key of _WEIGHTS, or path
     notes: tuple[str, ...]  # What was left out or assumed
-    traces: Traces  # For a page
+    # For a page: the part compared, stamps in s after the first sample; one simulation of it, V;
+    # every stride-th sample of each, V; and the measures of the recording, then of each.
+    part: Recording
+    one: FloatArray
+    stride: int
+    drawn: npt.NDArray[np.float32]
+    yardstick: Yardstick
+    measured: tuple[Measures, ...]
 
     def of(self, kind: str) -> list[ComparedNumber]:
         """Return the rows of a kind."""
@@ -184,7 +188,7 @@ class Agreement:
     @property
     def seeds(self) -> int:
         """Return the number of simulations."""
-        return int(self.rows[0].simulated.size)
+        return len(self.drawn)
 
     @property
     def in_part(self) -> bool:
@@ -196,7 +200,7 @@ class Agreement:
     def worst(self) -> str:
         """Return the largest difference in a sentence."""
         chance = '' if self.verdict is Likeness.DIFFERS or self.in_part else ', within chance'
-        return f'Largest difference{chance}: in the simulation, {self.words}.'
+        return f'Largest difference{chance}: {self.words}.'
 
     def measures(self) -> list[dict[str, Any]]:
         """Return all numbers of the recording and of the simulations, in SI units."""
@@ -228,24 +232,16 @@ _BANDS, _SEGMENT = 5, 20.0
 _RISE, _WITHIN, _QUIET = 0.1, 0.2, 1.0
 # Response: time before and after a rise begins, s, points, and minimum number of rises.
 _BEFORE, _AFTER, _POINTS, _FEWEST = 0.2, 1.5, 86, 3
+# Time after a rise begins at which the recovery is measured, s.
+RECOVERED = 1.0
 # Bins of the distribution.
 _BINS = 2000
-
-
-@dataclass(frozen=True, eq=False)
-class Measures:
-    """Measures of one voltage."""
-
-    # Numbers of the rows, but the KS distance: V, or dips per minute.
-    numbers: FloatArray
-    response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
-    distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
 
 class Yardstick:
     """Levels, frequency bands and rises of a recording, by which voltages are compared."""
 
-    def __init__(self, samples: Readings, lsb: float, limits: tuple[float, ...] = (),
+    def __init__(self, samples: Recording, lsb: float, limits: tuple[float, ...] = (),
                  code: float = 0.0) -> None:
         # lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones; code:
         # one code of the ADC, V.
@@ -255,14 +251,11 @@ class Yardstick:
         low = dict.fromkeys(between_codes(float(np.quantile(v, share)), lsb, code)
                             for share in LOW_SHARES)
         self.levels = [*limits, *low]
-        u = np.full(t.size, NAN) if samples.throttle is None else samples.throttle
-        flown = Recording(t, v, u, current=samples.current)
-        flown, left = without_wild(flown, remainder(flown))
-        self._rise = rise_that_ends(v, u, noise_of(flown, left))
-        self._rate = 1.0 / samples.spacing
+        flown, left = without_wild(samples, remainder(samples))
+        self._rise = rise_that_ends(v, samples.throttle, noise_of(flown, left))
+        self._rate = 1.0 / float(np.median(np.diff(t)))
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
-        lowest, highest = self._rate / self._segment, 0.5 * self._rate
-        self._bands = np.geomspace(lowest, highest, _BANDS + 1)
+        self._bands = np.geomspace(self._rate / self._segment, 0.5 * self._rate, _BANDS + 1)
         self._line = _lasting_line(np.nan_to_num(left.voltage), self._rate)
         self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
@@ -275,8 +268,8 @@ class Yardstick:
         """Measure a voltage at the stamps of the part, V."""
         dips = [dip_begins(v, level, self._rise).size / self._minutes for level in self.levels]
         f, density = welch(v, self._rate, nperseg=self._segment)
-        at = np.clip(np.searchsorted(self._bands, f, side='right') - 1, -1, _BANDS - 1)
-        power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])
+        power = f[1] * np.histogram(
+            np.minimum(f, self._bands[-1]), self._bands, weights=density)[0]
         response, falls = np.empty(0), []
         if self.rises.size >= _FEWEST:
             around = np.interp(self.rises[:, None] + self.after, self._t, v)
@@ -294,50 +287,33 @@ class Yardstick:
             np.array([v.min(), v.mean(), *dips, *falls, *np.sqrt(power), *line]), response,
             np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
-    def rows(self, own: Measures, others: Sequence[Measures], bias: Sequence[float]
-             ) -> list[ComparedNumber]:
-        """Return the rows of a table (bias: of the mean path by third, V)."""
+    def rows(self, measured: Sequence[Measures]) -> list[ComparedNumber]:
+        """Return the rows of a table, from the recording's measures and each simulation's."""
+        own = measured[0]
         volts = max(_RANGE * self._spread, 1e-12)
-        rows: list[ComparedNumber] = []
-        numbers = zip(own.numbers.tolist(), np.array([one.numbers for one in others]).T)
-
-        def add(kind: str, name: str, unit: str, digits: int, least: float, words: str,
-                *at: float) -> None:
-            rows.append(ComparedNumber(kind, name, unit, digits, *next(numbers), least, words, at))
-
-        add('lowest', 'lowest voltage', 'V', 4, volts,
-            'the lowest voltage is {median} V ({low} to {high}), measured {measured} V')
-        add('level', 'mean voltage', 'V', 4, volts, _level_words(bias, volts))
+        named: list[tuple[str, str, str, int, float, tuple[float, ...]]] = [
+            ('lowest', 'lowest voltage', 'V', 4, volts, ()),
+            ('level', 'mean voltage', 'V', 4, volts, ())]
         for level, rate in zip(self.levels, own.numbers[2:].tolist()):
             # Poisson error of the count.
             chance = math.sqrt(max(rate * self._minutes, 1.0)) / self._minutes
-            below = f'dips below {round(level, 3):g} V'
-            add('dips', below, '1/min', 3, max((_RATE - 1.0) * rate, chance),
-                f'the voltage {below} {{median}} times a minute ({{low}} to {{high}}), measured '
-                '{measured}', level)
+            named.append(('dips', f'dips below {round(level, 3):g} V', '1/min', 3,
+                          max((_RATE - 1.0) * rate, chance), (level,)))
         if own.response.size:
-            add('answer', 'fall after rises', 'V', 3, volts,
-                'after rises of throttle the voltage falls by {median} mV ({low} to {high}), '
-                'measured {measured} mV')
-            add('answer', 'fall left after 1 s', 'V', 3, volts,
-                'a second after rises of throttle the voltage is down by {median} mV ({low} to '
-                '{high}), measured {measured} mV')
-        for low, high in zip(self._bands.tolist(), self._bands[1:].tolist()):
-            first, last = number(low, 2), number(high, 2)
-            add('spectrum', f'rms {first} to {last} Hz', 'V', 3, math.log(_POWER),
-                f'between {first} and {last} Hz the simulated voltage has {{ratio}} times the '
-                'measured power', low, high)
+            named += [('answer', name, 'V', 3, volts, ())
+                      for name in ('fall after rises', 'fall left after 1 s')]
+        named += [('spectrum', f'rms {number(low, 2)} to {number(high, 2)} Hz', 'V', 3,
+                   math.log(_POWER), (low, high))
+                  for low, high in zip(self._bands.tolist(), self._bands[1:].tolist())]
         if self._line is not None:
-            hz = number(self._line.frequency, 4)
-            add('line', f'rms at {hz} Hz (line)', 'V', 3, volts,
-                f'the line at {hz} Hz has {{median}} mV rms, measured {{measured}} mV',
-                self._line.frequency)
-        pooled = np.mean([one.distribution for one in (own, *others)], axis=0)
-        return [*rows, ComparedNumber(
-            'ks', 'distribution (KS distance)', '', 2, distance(own, pooled),
-            np.array([distance(one, pooled) for one in others]), _KS,
-            'the share of time below a voltage differs by up to {measured} (simulations among '
-            'themselves: {low} to {high})')]
+            at = self._line.frequency
+            named.append(('line', f'rms at {number(at, 4)} Hz (line)', 'V', 3, volts, (at,)))
+        named.append(('ks', 'distribution (KS distance)', '', 2, _KS, ()))
+        pooled = np.mean([one.distribution for one in measured], axis=0)
+        numbers = np.array([[*one.numbers, np.abs(one.distribution - pooled).max()]
+                            for one in measured])
+        return [ComparedNumber(kind, name, unit, digits, float(x[0]), x[1:], least, at)
+                for (kind, name, unit, digits, least, at), x in zip(named, numbers.T)]
 
 
 def _lasting_line(rest: FloatArray, rate: float) -> Line | None:
@@ -350,59 +326,23 @@ def _lasting_line(rest: FloatArray, rate: float) -> Line | None:
         for other in second)), key=lambda line: line.rms, default=None)
 
 
-def _level_words(bias: Sequence[float], volts: float) -> str:
-    first, *_, last = bias
-    more = (f' ({_off(first)} in the first third, {_off(last)} in the last)'
-            if abs(last - first) > max(volts, abs(first)) else '')
-    return f'the voltage is on average {_off(float(np.mean(bias)))}{more}'
-
-
-def _off(v: float) -> str:
-    return f'{number(1e3 * abs(v), 2)} mV too {"high" if v > 0.0 else "low"}'
-
-
-def distance(one: Measures, pooled: FloatArray) -> float:
-    """Return the Kolmogorov-Smirnov distance of a voltage from a pooled distribution."""
-    return float(np.max(np.abs(one.distribution - pooled)))
-
-
 def between_codes(level: float, lsb: float, code: float = 0.0) -> float:
     """Return the midpoint between the two codes around a level, V (code: any code)."""
     return code + (np.floor((level - code) / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
 
 
-def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64]:
+def _rise_times(t: FloatArray, throttle: FloatArray) -> npt.NDArray[np.float64]:
     """Return the stamps at which throttle begins to rise, s."""
-    if throttle is None:
-        return np.empty(0)
     before = np.searchsorted(t, t - _WITHIN)
     rising = throttle - throttle[before] >= _RISE
-    begins = np.flatnonzero(rising[1:] & ~rising[:-1]) + 1
     found: list[float] = []
-    for k in begins:
-        since = t[k]
-        room = t[0] + _BEFORE < since - _WITHIN and since + _AFTER < t[-1]
-        if room and (not found or since - found[-1] > _QUIET):
+    for k in np.flatnonzero(rising[1:] & ~rising[:-1]) + 1:
+        room = t[0] + _BEFORE + _WITHIN < t[k] < t[-1] - _AFTER
+        if room and (not found or t[k] - found[-1] > _QUIET):
             # The rise is detected at its end; its beginning is the steepest point.
-            window = throttle[before[k]:k + 1]
-            steepest = int(np.argmax(np.diff(window))) if window.size > 1 else 0
+            steepest = int(np.argmax(np.diff(throttle[before[k]:k + 1])))
             found.append(float(t[before[k] + steepest]))
     return np.array(found)
-
-
-# Probability of a false `DIFFERS` by the largest score; with n < 49 simulations it is 1 / (n + 1),
-# and the score must exceed all of theirs.
-LEVEL = 0.02
-# Importance for a pilot, relative to the lowest voltage and the number of dips.
-_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'line': 0.8,
-            'spectrum': 0.5, 'ks': 0.5}
-# Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
-# and of a power, and a KS distance.
-_RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
-# Ends of a 95 % band, %.
-_LOW, _HIGH = 2.5, 97.5
-# Time after a rise begins at which the recovery is measured, s.
-RECOVERED = 1.0
 
 
 def judge(found: Sequence[ComparedNumber], explained: float, moved: bool
@@ -412,18 +352,18 @@ def judge(found: Sequence[ComparedNumber], explained: float, moved: bool
     scores = np.array([one.scores() for one in found])
     largest = scores.max(axis=0)
     p = float(np.mean(largest >= largest[0]))
-    worst = int(np.argmax(scores[:, 0]))
-    level = next(k for k, one in enumerate(found) if one.kind == 'level')
     rare = p <= max(LEVEL, 1.0 / largest.size)
-    verdict = Likeness.DIFFERS if rare else Likeness.LOOKS_LIKE_IT
-    if verdict is Likeness.LOOKS_LIKE_IT and moved and explained < 0.0:
+    if moved and explained < 0.0 and not rare:
         return p, Likeness.DIFFERS, (
             f'the mean path explains {number(100.0 * explained, 2)} % of the variance, less than '
             'a constant would'), 'path'
-    if found[level].off and not any(one.off for one in found if one.kind == 'answer'):
+    worst = found[int(np.argmax(scores[:, 0]))]
+    off = {one.kind: one for one in found
+           if not one.inside and abs(one.measured - one.median) > one.least}
+    if 'level' in off and 'answer' not in off:
         # The other differences follow from the level, unless the response to throttle is wrong.
-        verdict, worst = Likeness.DIFFERS, level
-    return p, verdict, found[worst].words, found[worst].kind
+        rare, worst = True, off['level']
+    return p, Likeness.DIFFERS if rare else Likeness.LOOKS_LIKE_IT, worst.words, worst.kind
 
 
 # Minimum readings and duration, s, of a part; minimum number of simulations (at which 5 % of good
@@ -431,12 +371,16 @@ def judge(found: Sequence[ComparedNumber], explained: float, moved: bool
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Maximum points of the band on a page.
 _PLOTTED = 2000
-# Probability above which the other kind of level (constant or falling) is reported.
-_UNSURE = 0.05
 # Minimum time at the beginning of the recording over which a model from a file is aligned, s.  It
 # is doubled until the means over it differ between simulations by a standard deviation of at most
 # `_STEADY` times that of single samples; it then holds about ten independent pieces.
 _ALIGNED, _STEADY = 2.0, 0.3
+# Probability above which the other kind of level (constant or falling) is reported.
+_UNSURE = 0.05
+# What is said of the load that was fitted.
+_LOADS = {LoadInput.NONE: ['No recorded load explains the voltage: only level and noise are '
+                           'simulated.'],
+          LoadInput.THROTTLE: [], LoadInput.CURRENT: ['The simulated load is the current.']}
 
 
 def compare(recording: Recording, model: SupplyModel | None = None, *,
@@ -448,8 +392,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:
         raise ValueError(f'seeds must lie within {_FEWEST_SEEDS} to {_MOST_SEEDS}, got {seeds}')
     notes = list(recording.notes)
-    samples, offset = _samples(recording, notes)
-    duration = float(samples.t[-1])
+    samples = _samples(recording, notes)
     begin = _start_index(samples, fit_until, fitted=model is None)
     late: list[str] = []
     if samples.current is not None:
@@ -457,87 +400,69 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
                                 begin if model is None else None)
         samples = replace(samples, current=current * (sign if model is None else 1.0))
     if model is None:
-        fitted = fit_flight(samples.part(slice(0, begin)))
-        names, draw = fitted.names, fitted.simulator(samples)
-        notes += (late if fitted.fits[0].load is LoadInput.CURRENT else []) + _fit_notes(
-            fitted, samples)
-        report(0.3)
+        fitted = fit_flight(part_of(samples, slice(0, begin)))
+        fit, names, draw = fitted.fits[0], fitted.names, fitted.simulator(samples)
+        notes += (late if fit.load is LoadInput.CURRENT else []) + _LOADS[fit.load]
+        if (doubt := float(1.0 - fitted.odds[0])) > _UNSURE:
+            notes.append('Whether the pack discharges is open: the level '
+                         f'{"is constant" if fit.falls else "falls"} in {percent(doubt)} of the '
+                         'simulations.')
+        elif fit.load is not LoadInput.NONE and not fit.falls:
+            notes.append('No discharge is visible, so the level is constant.')
     else:
-        _check_load(model, samples, recording.name)
         names, draw = [term.NAME for term in model.terms], file_simulator(model, samples)
         notes += late if model.full_current else []
         notes.append('The errors of the parameters in the model file are not simulated: the '
                      'bands include only the noise.')
-    part = slice(begin, samples.t.size)
+    report(0.3)
     # Codes of an ADC may have any offset.
-    lsb, code = samples.lsb, float(np.sort(samples.voltage)[samples.t.size // 2])
+    lsb, code = find_step(samples.voltage), float(np.sort(samples.voltage)[samples.n // 2])
 
     def read(v: FloatArray) -> FloatArray:
         return np.asarray(code + lsb * np.rint((v - code) / lsb)) if lsb > 0.0 else v
 
-    own = samples.part(part)
+    own = part_of(samples, slice(begin, None))
     own = replace(own, voltage=read(own.voltage))
     yardstick = Yardstick(own, lsb, levels, code)
-    rng = np.random.default_rng(seed)
-    shifts = np.zeros(seeds)
-    stride = max(1, -(-own.t.size // _PLOTTED))
+    stride = -(-own.n // _PLOTTED)
     # A model from a file has the level of another flight.
-    aligned = None
-    if model is not None:
-        drawn = []
-        for k in range(_FEWEST_SEEDS):
-            drawn.append(draw(np.random.default_rng((seed, k)))[part][::stride])
-            report(0.3 * (k + 1) / _FEWEST_SEEDS)
-        aligned = _beginning(own.t, np.array(drawn), stride)
-    measured: list[Measures] = []
-    traces = np.empty((seeds, own.voltage[::stride].size), dtype=np.float32)
-    total, first = np.zeros(own.t.size), own.voltage
-    strays = 0
+    aligned = slice(0) if model is None else _beginning(own.t, np.array([
+        draw(np.random.default_rng((seed, k)))[begin::stride]
+        for k in range(_FEWEST_SEEDS)]), stride)
+    rng, shifts = np.random.default_rng(seed), np.zeros(seeds)
+    measured = [yardstick.measure(own.voltage)]
+    drawn = np.empty((seeds, own.t[::stride].size), dtype=np.float32)
+    total, one = np.zeros(own.n), own.voltage
     for k in range(seeds):
-        v = draw(rng)[part]
+        v = draw(rng)[begin:]
         if not np.isfinite(v).all():
             raise InputError('the model diverges over this throttle: its voltage is not finite')
-        if aligned is not None:
+        if model is not None:
             # Align each simulation by itself, so that the bands include the error of the level.
             shifts[k] = (own.voltage[aligned] - v[aligned]).mean()
             v = v + shifts[k]
         total += v
         v = read(v)
-        first = v if k == 0 else first
-        strays += stray(v, samples.voltage) > 0.0
+        one = v if k == 0 else one
         measured.append(yardstick.measure(v))
-        traces[k] = v[::stride]
+        drawn[k] = v[::stride]
         report(0.3 + 0.7 * (k + 1.0) / seeds)
-    if aligned is not None:
+    if model is not None:
         notes.append(f'The level of the model was moved by {number(float(shifts.mean()), 3)} V '
                      f'(+- {number(float(shifts.std()), 2)} V), so that the mean of the first '
                      f'{number(float(np.ptp(own.t[aligned])))} s of each simulation equals the '
                      "recording's.")
-    if strays:
-        notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
-                     'than half of it.')
-    path = fitted.path(samples)[part] if model is None else total / seeds
-    real = yardstick.measure(own.voltage)
+    path = fitted.path(samples)[begin:] if model is None else total / seeds
     error = path - own.voltage
-    thirds = tuple(float(third.mean()) for third in np.array_split(error, 3))
-    rows = yardstick.rows(real, measured, thirds)
-    explained = 1.0 - float(error @ error) / float(
-        np.sum((own.voltage - own.voltage.mean()) ** 2))
-    p, verdict, words, farthest = judge(rows, explained, own.throttle is not None and bool(
-        np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0))
-    low, high = np.percentile(traces, [_LOW, _HIGH], axis=0)
-    response_low, response_high = np.percentile(
-        [one.response for one in measured], [_LOW, _HIGH], axis=0)
+    rows = yardstick.rows(measured)
+    explained = 1.0 - float(np.mean(error ** 2) / own.voltage.var())
     return Agreement(
         recording.name, (0.0, float(own.t[0]) if model is None else 0.0),
-        (float(own.t[0]), duration), tuple(names),
+        (float(own.t[0]), float(own.t[-1])), tuple(names),
         explained, math.sqrt(float(np.mean(error ** 2))), round(float(error.mean()), 12),
-        thirds, tuple(rows), int(yardstick.rises.size), p, verdict, words, farthest, tuple(notes),
-        Traces(own.t + offset, own.voltage,
-               np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
-               own.t[::stride] + offset, low, high, yardstick.after, real.response, response_low,
-               response_high, yardstick.edges, real.distribution,
-               np.mean([one.distribution for one in measured], axis=0)))
+        tuple(float(third.mean()) for third in np.array_split(error, 3)), tuple(rows),
+        *judge(rows, explained, bool(np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0)),
+        tuple(notes), own, one, stride, drawn, yardstick, tuple(measured))
 
 
 def _beginning(t: FloatArray, drawn: FloatArray, stride: int) -> slice:
@@ -552,8 +477,8 @@ def _beginning(t: FloatArray, drawn: FloatArray, stride: int) -> slice:
     return slice(0, t.size)
 
 
-def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
-    """Return the readings without repeats, with stamps from 0 s on, and the first stamp, s."""
+def _samples(recording: Recording, notes: list[str]) -> Recording:
+    """Return the readings without repeats, with stamps from 0 s on."""
     t, v, u = usable(recording, notes)
     if v.size < 2 * _LEAST:
         raise InputError(f"'{recording.name}' holds {counted(v.size, 'usable sample')}; a "
@@ -565,12 +490,11 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
     if period > 1.0:
         notes.append(f'The logger repeats its last value, {number(period, 3)} samples per '
                      'reading: each reading is simulated and counted once.')
-    if u is not None:
-        u = np.clip(u, 0.0, 1.0)
-    return Readings(t - t[0], v, u, current_at(recording, t)), float(t[0])
+    return Recording(t - t[0], v, np.array(NAN) if u is None else np.clip(u, 0.0, 1.0),
+                     current=current_at(recording, t))
 
 
-def _start_index(samples: Readings, fit_until: float | None, fitted: bool) -> int:
+def _start_index(samples: Recording, fit_until: float | None, fitted: bool) -> int:
     duration = float(samples.t[-1])
     until = (0.5 * duration if fitted else 0.0) if fit_until is None else fit_until
     if not 0.0 <= until < duration or (fitted and not until > 0.0):
@@ -584,38 +508,3 @@ def _start_index(samples: Readings, fit_until: float | None, fitted: bool) -> in
                 f'the part to be {what} has {counted(n, "reading")} in {number(seconds, 3)} s; it '
                 f'needs {_LEAST} in more than {_SHORTEST:g} s')
     return begin
-
-
-def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
-    fit = model.fits[0]
-    if fit.load is not LoadInput.NONE:
-        found = []
-        if fit.load is LoadInput.CURRENT:
-            found.append('The simulated load is current, which explains the voltage better than '
-                         'throttle.' if samples.throttle is not None else
-                         'The simulated load is current.')
-        doubt = float(model.odds[1])
-        if doubt > _UNSURE:
-            found.append('Whether the pack discharges is open: the level '
-                         f'{"is constant" if fit.falls else "falls"} in {percent(doubt)} of the '
-                         'simulations.')
-        elif not fit.falls:
-            found.append('No discharge is visible, so the level is constant.')
-        return found
-    if samples.current is None and samples.throttle is None:
-        return ['Throttle is not recorded: only level and noise are simulated.']
-    if samples.current is None and samples.throttle is not None and not np.ptp(
-            samples.throttle) >= MOVES:
-        return ['Throttle does not move: only level and noise are simulated.']
-    return ['Neither throttle nor current explains the voltage: only level and noise are '
-            'simulated.']
-
-
-def _check_load(model: SupplyModel, samples: Readings, name: str) -> None:
-    """Raise InputError if the load of the model is missing."""
-    needs = model.needs_throttle
-    if needs and model.full_current and samples.current is None:
-        raise InputError(f"the load of the model is a current, and '{name}' has none")
-    if needs and not model.full_current and samples.throttle is None:
-        raise InputError(f"the model's term '{needs[0]}' needs throttle, and the recording has "
-                         'none')

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.comparison.compare import Agreement, LEVEL, Likeness
-from ou_monitor.records import FloatArray
+from ou_monitor.comparison.compare import Agreement, BAND, LEVEL, Likeness
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
@@ -47,33 +46,26 @@ def comparison_document(found: Agreement, seen: Overview) -> Document:
 
 
 def _answer(found: Agreement) -> list[str]:
-    low = found.lowest
-    lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
-              f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
-    if found.verdict is Likeness.LOOKS_LIKE_IT:
-        # Without load changes the mean path is at most a drift, and not worth a sentence.
-        path = [] if not (found.of('answer') and found.explained > 0.0) else [
-            f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
-        rows = _rows(found)
-        outside = [name.split(', ')[0] for name, _, _, remark in rows if remark]
-        if outside:
-            chance = 'more than chance explains' if found.in_part else 'chance allows this'
-            path.append(f'Outside their own bands ({chance} with {len(rows)} numbers): '
-                        f'{listed(outside)}.')
-        return [f"{found.verdict.value}{' only in part' * found.in_part}: its {lowest}.", *path]
-    more = [] if found.farthest == 'lowest' else [f'Its {lowest}.']
-    return [f'{found.verdict.value}: {found.words}.', *more]
+    if found.verdict is Likeness.DIFFERS:
+        more = [] if found.farthest == 'lowest' else [f'Beside it: {found.lowest.words}.']
+        return [f'{found.verdict.value}: {found.words}.', *more]
+    # Without load changes the mean path is at most a drift, and not worth a sentence.
+    path = [] if not (found.of('answer') and found.explained > 0.0) else [
+        f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
+    outside = [row.name for row in found.rows if not row.inside]
+    if outside:
+        chance = 'more than chance explains' if found.in_part else 'chance allows this'
+        path.append(f'Outside their own bands ({chance} with {len(found.rows)} numbers): '
+                    f'{listed(outside)}.')
+    return [f"{found.verdict.value}{' only in part' * found.in_part}: {found.lowest.words}.",
+            *path]
 
 
 def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
     """Return quantity, measured, simulated with its 95 % band, and a remark."""
     out = []
     for row in found.rows:
-        # Levels in V, differences in mV.
-        factor, unit = (1e3, 'mV') if (row.unit, row.digits) == ('V', 3) else (1.0, row.unit)
-        measured, low, median, high = (
-            number(factor * x, row.digits)
-            for x in (row.measured, row.low, row.median, row.high))
+        unit, measured, low, median, high = row.texts
         out.append((f'{row.name}, {unit}'.removesuffix(', '), measured,
                     f'{median}\n[{low}, {high}]', '' if row.inside else 'outside'))
     return out
@@ -91,40 +83,36 @@ def _path(found: Agreement) -> list[tuple[str, str]]:
             *worst]
 
 
-def _since_start(found: Agreement) -> tuple[FloatArray, float]:
-    """Return the times of the traces since the first sample, s, and the stamp of that sample."""
-    begin = float(found.traces.t[0]) - found.simulated[0]
-    return found.traces.t - begin, begin
-
-
 def _voltage(found: Agreement) -> Plot:
-    at = found.traces
+    t = found.part.t
     plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300)
-    # Count from the first sample, as on other pages: stamps may be dates.
-    t, begin = _since_start(found)
-    plot.band(at.at - begin, at.low, at.high, 'simulated, 95 %', _SIMULATED)
-    plot.line(t, at.simulated, 'one simulation', _SIMULATED, 'faint')
-    plot.line(t, at.voltage, 'measured', 0)
+    low, high = np.percentile(found.drawn, BAND, axis=0)
+    plot.band(t[::found.stride], low, high, 'simulated, 95 %', _SIMULATED)
+    plot.line(t, found.one, 'one simulation', _SIMULATED, 'faint')
+    plot.line(t, found.part.voltage, 'measured', 0)
     for row in found.of('dips'):
         plot.level(t, row.at[0], '', _MEASURED)
     return plot
 
 
 def _others(found: Agreement) -> list[Part]:
-    at = found.traces
+    own, *others = found.measured
+    ruler = found.yardstick
     drawn: list[Part] = []
-    if np.isfinite(at.throttle).any():
+    if found.part.has_throttle:
         drawn.append(Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
-            _since_start(found)[0], at.throttle, '', 2)))
+            found.part.t, found.part.throttle, '', 2)))
     beside = []
-    if at.response.size:
-        plot = Plot(f'Mean response to {found.rises} rises of throttle', 'time since the rise, s',
-                    'change, V', width=450, height=250)
-        plot.band(at.after, at.response_low, at.response_high, 'simulated, 95 %', _SIMULATED)
-        beside.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
+    if own.response.size:
+        plot = Plot(f'Mean response to {ruler.rises.size} rises of throttle',
+                    'time since the rise, s', 'change, V', width=450, height=250)
+        low, high = np.percentile([one.response for one in others], BAND, axis=0)
+        plot.band(ruler.after, low, high, 'simulated, 95 %', _SIMULATED)
+        beside.append(Figure(plot.line(ruler.after, own.response, 'measured', 0, 'thick')))
     plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250)
-    plot.line(at.edges, at.simulated_distribution, 'simulated', _SIMULATED, 'thick')
-    beside.append(Figure(plot.line(at.edges, at.distribution, 'measured', 0, 'thick')))
+    plot.line(ruler.edges, np.mean([one.distribution for one in others], axis=0), 'simulated',
+              _SIMULATED, 'thick')
+    beside.append(Figure(plot.line(ruler.edges, own.distribution, 'measured', 0, 'thick')))
     return [*drawn, Pair(beside), Figure(_spectrum(found))]
 
 
