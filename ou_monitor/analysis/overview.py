@@ -17,10 +17,11 @@ from ou_monitor.analysis.level_result import LevelResult, ProcessType
 from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
 from ou_monitor.analysis.quality import beware
 from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
+from ou_monitor.criticism.readings import on_time
 from ou_monitor.model.spectral_lines import fundamental_of
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
-from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
+from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts
 
 # Largest extrapolated sag that is given, relative to the level: a source with a resistance gives
@@ -60,7 +61,8 @@ class Overview:
     highest: float  # Highest throttle; NaN without throttle
     # Lowest and highest index of THROTTLES near which there are enough readings.
     flown: tuple[int, int]
-    drawn: float = NAN  # Largest current, A, after a median of three readings; NaN without one
+    # Largest current, A, after a median of three readings; positive lowers the voltage; NaN: none.
+    drawn: float = NAN
     # Ratio of the noise at the highest throttle flown to the noise at the lowest, from a fit.
     growth: float = 1.0
     step: float = 0.0  # Median time between readings, s
@@ -101,7 +103,7 @@ def overview(recording: Recording, limit: float | None = None,
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
-                    _largest(recording.current), _growth(recording, facts.noise.rms_v, near),
+                    _largest(recording), _growth(recording, facts.noise.rms_v, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
                     beware(recording, cells))
@@ -117,9 +119,12 @@ def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> 
     return math.exp(slope * float(u[-1] - u[0]))
 
 
-def _largest(current: FloatArray | None) -> float:
-    known = np.empty(0) if current is None else np.abs(current[np.isfinite(current)])
-    return float(np.median(sliding_window_view(known, 3), axis=1).max()) if known.size > 2 else NAN
+def _largest(recording: Recording) -> float:
+    if recording.current is None or (known := np.isfinite(recording.current)).sum() < 3:
+        return NAN
+    current = recording.current[known]
+    _, sign = on_time(recording.t[known], recording.voltage[known], current, 'current', [])
+    return float(np.median(sliding_window_view(sign * current, 3), axis=1).max())
 
 
 def _whole(levels: Sequence[LevelResult], recording: Recording, ou: OuFacts) -> OuFacts | None:
@@ -197,7 +202,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                          if resistance.at_once_ohm > 0.0 else '')
                       + (f'; times the largest current: {fall}'
                          if (fall := _fall_words(found)) else '')))
-    elif found.drawn > 0.0:
+    elif abs(found.drawn) > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little or too seldom, or a '
                       'load seems to bypass the current sensor'))
     lines.append(('Relaxation', _ou_words(found.facts.ou, found.whole)))

@@ -293,6 +293,12 @@ def test_a_current_that_throttle_does_not_tell_gives_the_fall(step):
     assert ohm == pytest.approx(0.02, rel=0.1)
     assert f'lowers the rail by {ohm * found.drawn:.2f} V' in answers(found)[1]
     assert ' after 1 s' in dict(known_lines(found))['Resistance']
+    # Of either sign; a current that charges lowers nothing.
+    for sign, charge in ((-1.0, 0.0), (1.0, 60.0), (-1.0, 60.0)):
+        other = overview(Recording(step * np.arange(n), v + 0.02 * charge, throttle,
+                                   current=sign * (drawn - charge)))
+        assert other.drawn < 0.2 if charge else other.drawn == found.drawn
+        assert any('lowers' in one for one in answers(other)) == (not charge)
 
 
 def test_words_are_those_of_the_facts():

@@ -34,13 +34,14 @@ class Drift(Term):
     MEASURED = True
     # The form of a larger effect is never exact, and a trend may explain the little that is left.
     LEAST_SHARE = 0.02
-    MEANING = 'The mean moves slowly with time: discharge or warming.'
+    MEANING = ('The mean moves slowly, by rate without load plus charge at full load (a fall is '
+               'negative): discharge or warming.')
     REMEDY = 'Use a window in which the drift is small, or remove the trend first.'
     SEPARATED_BY = 'a recording several times as long'
 
-    rate: float = parameter('V/s', 'slope at the first sample')
+    rate: float = parameter('V/s', 'slope at the first sample, without load')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
-    charge: float = parameter('V/s', 'slope added at full throttle', default=0.0)
+    charge: float = parameter('V/s', 'slope added at full load', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         drawn = 0.0
