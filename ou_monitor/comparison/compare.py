@@ -68,10 +68,10 @@ class ComparedNumber:
     name: str
     unit: str
     digits: int
+    least: float  # Minimum half-width of the band in which scores are counted
+    at: tuple[float, ...]  # Level, V, or frequencies, Hz
     measured: float  # In the recording
     simulated: FloatArray  # In each simulation; shape (seeds,)
-    least: float  # Minimum half-width of the band in which scores are counted
-    at: tuple[float, ...] = ()  # Level, V, or frequencies, Hz
     # 2.5 %, 50 % and 97.5 % quantiles of the simulations.
     low: float = field(init=False)
     median: float = field(init=False)
@@ -97,11 +97,6 @@ class ComparedNumber:
         # No distance from the distribution is too small.
         low = 0.0 if self.kind == 'ks' else self.low
         return np.asarray((values < low - hair) | (values > self.high + hair))
-
-    @property
-    def power_ratio(self) -> float:
-        """Return the power of the simulations over the recording's; NaN for a power of 0."""
-        return (self.median / self.measured) ** 2 if self.measured > 0.0 else NAN
 
     @property
     def texts(self) -> list[str]:
@@ -137,12 +132,15 @@ class ComparedNumber:
         return np.asarray(_WEIGHTS[self.kind] * np.abs(off) / half)
 
 
+# The fields of a `ComparedNumber` up to `measured`.
+_Number = tuple[str, str, str, int, float, tuple[float, ...], float]
+
+
 @dataclass(frozen=True, eq=False)
 class Measures:
     """Measures of one voltage."""
 
-    # Numbers of the rows, but the KS distance: V, or dips per minute.
-    numbers: FloatArray
+    numbers: list[_Number]  # All but the KS distance
     response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
     distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
@@ -218,7 +216,8 @@ class Agreement:
             'crossings_per_min': [{'level_v': row.at[0], **row.as_data()}
                                   for row in self.of('dips')],
             'spectrum': [{'from_hz': row.at[0], 'to_hz': row.at[1],
-                          'simulated_over_measured': row.power_ratio}
+                          'simulated_over_measured': (
+                             (row.median / row.measured) ** 2 if row.measured > 0.0 else NAN)}
                          for row in self.of('spectrum')],
             'ks_distance': self.of('ks')[0].measured, 'worst': self.worst,
             'verdict': self.verdict.name.lower()}
@@ -266,54 +265,47 @@ class Yardstick:
 
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
-        dips = [dip_begins(v, level, self._rise).size / self._minutes for level in self.levels]
-        f, density = welch(v, self._rate, nperseg=self._segment)
-        power = f[1] * np.histogram(
-            np.minimum(f, self._bands[-1]), self._bands, weights=density)[0]
-        response, falls = np.empty(0), []
+        volts = max(_RANGE * self._spread, 1e-12)
+        found: list[_Number] = [
+            ('lowest', 'lowest voltage', 'V', 4, volts, (), float(v.min())),
+            ('level', 'mean voltage', 'V', 4, volts, (), float(v.mean()))]
+        for level in self.levels:
+            count = dip_begins(v, level, self._rise).size
+            # The Poisson error of the count, at least.
+            least = max((_RATE - 1.0) * count, math.sqrt(max(count, 1)))
+            found.append(('dips', f'dips below {round(level, 3):g} V', '1/min', 3,
+                          least / self._minutes, (level,), count / self._minutes))
+        response = np.empty(0)
         if self.rises.size >= _FEWEST:
             around = np.interp(self.rises[:, None] + self.after, self._t, v)
             before = around[:, self.after < 0.0].mean(axis=1, keepdims=True)
             response = (around - before).mean(axis=0)
             begin, later = np.searchsorted(self.after, [0.0, RECOVERED]).tolist()
-            falls = [-response[begin:].min(), -response[later]]
-        line = []
+            found += [('answer', 'fall after rises', 'V', 3, volts, (), -response[begin:].min()),
+                      ('answer', 'fall left after 1 s', 'V', 3, volts, (), -response[later])]
+        f, density = welch(v, self._rate, nperseg=self._segment)
+        power = f[1] * np.histogram(
+            np.minimum(f, self._bands[-1]), self._bands, weights=density)[0]
+        found += [('spectrum', f'rms {number(low, 2)} to {number(high, 2)} Hz', 'V', 3,
+                   math.log(_POWER), (low, high), math.sqrt(one))
+                  for low, high, one in zip(self._bands.tolist(), self._bands[1:].tolist(), power)]
         if self._line is not None:
-            width = self._line.resolution
+            at, width = self._line.frequency, self._line.resolution
             f, density = welch(v, self._rate, nperseg=min(v.size, round(self._rate / width)))
-            near = np.abs(f - self._line.frequency) <= LOBE * width
-            line = [math.sqrt(width * density[near].sum())]
-        return Measures(
-            np.array([v.min(), v.mean(), *dips, *falls, *np.sqrt(power), *line]), response,
-            np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
+            found.append(('line', f'rms at {number(at, 4)} Hz (line)', 'V', 3, volts, (at,),
+                          math.sqrt(width * density[np.abs(f - at) <= LOBE * width].sum())))
+        return Measures(found, response,
+                        np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
-    def rows(self, measured: Sequence[Measures]) -> list[ComparedNumber]:
-        """Return the rows of a table, from the recording's measures and each simulation's."""
-        own = measured[0]
-        volts = max(_RANGE * self._spread, 1e-12)
-        named: list[tuple[str, str, str, int, float, tuple[float, ...]]] = [
-            ('lowest', 'lowest voltage', 'V', 4, volts, ()),
-            ('level', 'mean voltage', 'V', 4, volts, ())]
-        for level, rate in zip(self.levels, own.numbers[2:].tolist()):
-            # Poisson error of the count.
-            chance = math.sqrt(max(rate * self._minutes, 1.0)) / self._minutes
-            named.append(('dips', f'dips below {round(level, 3):g} V', '1/min', 3,
-                          max((_RATE - 1.0) * rate, chance), (level,)))
-        if own.response.size:
-            named += [('answer', name, 'V', 3, volts, ())
-                      for name in ('fall after rises', 'fall left after 1 s')]
-        named += [('spectrum', f'rms {number(low, 2)} to {number(high, 2)} Hz', 'V', 3,
-                   math.log(_POWER), (low, high))
-                  for low, high in zip(self._bands.tolist(), self._bands[1:].tolist())]
-        if self._line is not None:
-            at = self._line.frequency
-            named.append(('line', f'rms at {number(at, 4)} Hz (line)', 'V', 3, volts, (at,)))
-        named.append(('ks', 'distribution (KS distance)', '', 2, _KS, ()))
-        pooled = np.mean([one.distribution for one in measured], axis=0)
-        numbers = np.array([[*one.numbers, np.abs(one.distribution - pooled).max()]
-                            for one in measured])
-        return [ComparedNumber(kind, name, unit, digits, float(x[0]), x[1:], least, at)
-                for (kind, name, unit, digits, least, at), x in zip(named, numbers.T)]
+
+def rows_of(measured: Sequence[Measures]) -> list[ComparedNumber]:
+    """Return the rows of a table, from the recording's measures and each simulation's."""
+    pooled = np.mean([one.distribution for one in measured], axis=0)
+    every: list[list[_Number]] = [[*one.numbers, (
+        'ks', 'distribution (KS distance)', '', 2, _KS, (),
+        float(np.abs(one.distribution - pooled).max()))] for one in measured]
+    return [ComparedNumber(*own, np.array([other[k][-1] for other in every[1:]]))
+            for k, own in enumerate(every[0])]
 
 
 def _lasting_line(rest: FloatArray, rate: float) -> Line | None:
@@ -454,7 +446,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
                      "recording's.")
     path = fitted.path(samples)[begin:] if model is None else total / seeds
     error = path - own.voltage
-    rows = yardstick.rows(measured)
+    rows = rows_of(measured)
     explained = 1.0 - float(np.mean(error ** 2) / own.voltage.var())
     return Agreement(
         recording.name, (0.0, float(own.t[0]) if model is None else 0.0),
