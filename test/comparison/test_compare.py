@@ -426,7 +426,7 @@ def test_a_fall_is_a_dip_of_the_facts():
     levels = (4.75, 5.0)
     yardstick = Yardstick(Recording(own.t, v, u), 0.0, levels)
     rates = [one[-1] for one in yardstick.measure(v).numbers if one[0] == 'dips']
-    counts = np.array(rates) * np.ptp(own.t) / 60.0
+    counts = np.array(rates[:2]) * np.ptp(own.t) / 60.0
     assert counts.tolist() == pytest.approx([supply_facts(own, x).dips.count for x in levels])
     crossings = [np.count_nonzero((v[:-1] >= x) & (v[1:] < x)) for x in levels]
     assert np.all(counts < 0.8 * np.array(crossings)) and np.all(counts > 0)
