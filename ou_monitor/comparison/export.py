@@ -8,7 +8,6 @@ of them simulates noise, lags, inrush or an ADC.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 import json
 import math
@@ -33,8 +32,6 @@ SOURCES = {
                   'SIM_Frame.h 07b1fa1, libraries/AP_BattMonitor/AP_BattMonitor_Params.cpp '
                   '000ecd1'),
 }
-# Terms that a target can express, at least in part.
-_KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.
 _EMPTY, _CRITICAL = 3.5, 3.3
 _SEEDS = 20  # Simulations of each model
@@ -58,10 +55,11 @@ class _Numbers:
     empty: float  # Level that counts as empty, V
     drain: float  # Time between these levels under the usual load, s; inf: no discharge
     charge: float  # Charge drawn between these levels, 0..1 of the pack
+    capacity: float  # Ah; NaN: unknown
+    current: float  # Current at full throttle, A; NaN: unknown
     share: float  # Usual load, as a share of the load at full throttle
     sag: float  # Sag at full throttle, V
     usual_sag: float  # Sag under the usual load, V
-    stated: float = math.nan  # Capacity that the recording states, Ah
 
 
 def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float,
@@ -74,23 +72,26 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
                 'load': None if model.load is None else model.load.values(),
                 'full_load_a': model.full_current or None}
         return Export(json.dumps(data, indent=1, allow_nan=False), (), model)
-    if math.isnan(full_current) and model.full_current:
-        full_current = abs(model.full_current)
-    n = replace(_numbers(model, throttle), stated=_stated_capacity(recording))
-    known = not math.isnan(full_current)
-    if known and not 0.0 < full_current < math.inf:
+    if math.isnan(full_current):
+        full_current = abs(model.full_current) or math.nan
+    if full_current <= 0.0 or math.isinf(full_current):
         raise InputError(f'--full-current must be above 0 A, got {full_current:g}')
-    if target != 'px4' and not known:
+    stated = _stated_capacity(recording)
+    n = _numbers(model, throttle, full_current, stated)
+    if target != 'px4' and math.isnan(full_current):
         raise InputError(f'--export {target} needs --full-current A, the current at full '
                          'throttle: the model has only throttle')
-    text = _WRITERS[target](n, full_current)
+    if target != 'px4' and math.isnan(n.capacity):
+        raise InputError('the model does not say how fast throttle empties the pack (load): '
+                         'no capacity can be given')
+    kept, lines = {'px4': (('drift',), _px4), 'gazebo': (('drift', 'load_sag'), _gazebo),
+                   'ardupilot': (('drift', 'load_sag'), _ardupilot)}[target]
+    sags = [t for t in model.terms if isinstance(t, LoadSag)]
     left = SupplyModel((replace(model.ou, sigma=0.0, u0=n.full - (
         n.usual_sag if target == 'gazebo' else 0.0)), *(
         () if math.isinf(n.drain) else (Drift((n.empty - n.full) / n.drain, 0.0),)), *(
-        t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))),
-        full_current=model.full_current)
-    notes = [*_omitted_terms(model, target, throttle, rate),
-             f'the number of cells, {n.cells}, is a guess from the voltage']
+        t.at(0.0) for t in sags if target == 'ardupilot')), full_current=model.full_current)
+    notes = _omitted_terms(model, kept, throttle, rate)
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is the sag under the usual load, {n.usual_sag:.3g} V: throttle '
                      'does not change it')
@@ -99,37 +100,43 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
                      f'{"the usual load" if target == "gazebo" else "full throttle"}; analyze '
                      'gives the resistance after 1 s')
     notes += [f'load_sag keeps its initial value: in the model, it grows by {t.growth:.3g} V/s at '
-              'full throttle' for t in model.terms
-              if target != 'px4' and isinstance(t, LoadSag) and t.growth]
-    if target != 'px4' and math.isnan(n.stated):
-        notes.append(f'the capacity, {_capacity(n, full_current):.3g} Ah, is estimated from the '
-                     'fall of the voltage: replace it by the capacity printed on the pack')
-    if recording is not None:
-        notes += _explained_words(model, left, recording)
-    return Export(text, tuple(notes), left)
+              'full throttle' for t in sags if target != 'px4' and t.growth]
+    if target != 'px4' and math.isnan(stated):
+        notes.append(f'the capacity, {n.capacity:.3g} Ah, is estimated from the fall of the '
+                     'voltage: replace it by the capacity printed on the pack')
+    for words, one in (('the model', model), ('the exported part', left)):
+        if recording is not None:
+            found = compare(recording, one, seeds=_SEEDS)
+            notes.append(
+                f'{words}: explains {100.0 * max(found.explained, 0.0):.0f} % of '
+                f'{recording.name}, lowest voltage {found.lowest.median:.2f} V (measured '
+                f'{found.lowest.measured:.2f} V). {found.verdict.value}')
+    return Export('\n'.join(lines(n)), tuple(notes), left)
 
 
-def _numbers(model: SupplyModel, throttle: FloatArray) -> _Numbers:
+def _numbers(model: SupplyModel, throttle: FloatArray, current: float, stated: float) -> _Numbers:
     load, u0 = model.load, model.ou.u0
     cells = round(load.cells) if load is not None else cells_in_series(u0)
-    share = float(np.mean(throttle ** POWER))
+    share = float(np.mean(np.maximum(throttle, 0.0) ** POWER))
     empty = min(cells * _EMPTY, u0)
-    drain, charge = math.inf, math.nan
+    drain, charge, capacity = math.inf, math.nan, stated
     drift = next((t for t in model.terms if isinstance(t, Drift)), None)
     if load is not None:
         charge = charge_at(u0 / load.cells) - charge_at(empty / load.cells)
-        if load.discharge * share > 0.0:
+        if load.discharge * share > 0.0 and charge > 0.0:
             drain = charge / (load.discharge * share)
+            if math.isnan(stated):
+                capacity = current * share * drain / charge / 3600.0
     elif drift is not None:
         rate = drift.rate + drift.charge * float(np.mean(throttle))
-        drain = (empty - u0) / rate if rate < 0.0 else math.inf
-    sags = [t for t in model.terms if isinstance(t, LoadSag)]
+        drain = (empty - u0) / rate if rate < 0.0 and empty < u0 else math.inf
 
     def sag(u: FloatArray) -> float:
-        return float(sum(np.mean(t.linear * u + t.square * u * u) for t in sags))
+        return float(sum(np.mean(t.linear * u + t.square * u * u)
+                         for t in model.terms if isinstance(t, LoadSag)))
 
-    return _Numbers(cells, u0, empty, drain if drain > 0.0 else math.inf, charge, share,
-                    sag(np.ones(1)), sag(throttle))
+    return _Numbers(cells, u0, empty, drain, charge, capacity, current, share, sag(np.ones(1)),
+                    sag(throttle))
 
 
 def _stated_capacity(recording: Recording | None) -> float:
@@ -139,31 +146,21 @@ def _stated_capacity(recording: Recording | None) -> float:
     return float(text) / 1e3 if re.fullmatch('[1-9][0-9]{0,6}', text) else math.nan
 
 
-def _px4(n: _Numbers, full_current: float) -> str:
-    return '\n'.join((
+def _px4(n: _Numbers) -> tuple[str, ...]:
+    return (
         f'# {SOURCES["px4"]}', f'param set BAT1_N_CELLS {n.cells}',
         f'param set BAT1_V_CHARGED {n.full / n.cells:.3f}',
         f'param set BAT1_V_EMPTY {n.empty / n.cells:.3f}',
         # 0 would disable the discharge.
         f'param set SIM_BAT_DRAIN {n.drain if math.isfinite(n.drain) else 1e6:.0f}',
-        'param set SIM_BAT_MIN_PCT 0'))
+        'param set SIM_BAT_MIN_PCT 0')
 
 
-def _capacity(n: _Numbers, full_current: float) -> float:
-    if math.isfinite(n.stated):
-        return n.stated
-    if not (math.isfinite(n.charge) and math.isfinite(n.drain)) or not n.charge > 0.0:
-        raise InputError('the model does not say how fast throttle empties the pack (load): '
-                         'no capacity can be given')
-    return full_current * n.share * n.drain / n.charge / 3600.0
-
-
-def _gazebo(n: _Numbers, full_current: float) -> str:
-    current = full_current * n.share
-    capacity = _capacity(n, full_current)
+def _gazebo(n: _Numbers) -> tuple[str, ...]:
+    current = n.current * n.share
     # A straight line over charge drawn, from the present level to empty: E = e0 + e1 (1 - q/c).
     slope = (n.empty - n.full) / n.charge
-    return '\n'.join((
+    return (
         f'<!-- {SOURCES["gazebo"]} -->',
         '<plugin filename="gz-sim-linearbatteryplugin-system"',
         '        name="gz::sim::systems::LinearBatteryPlugin">',
@@ -171,56 +168,38 @@ def _gazebo(n: _Numbers, full_current: float) -> str:
         f'  <voltage>{n.full:.3f}</voltage>',
         f'  <open_circuit_voltage_constant_coef>{n.full:.3f}</open_circuit_voltage_constant_coef>',
         f'  <open_circuit_voltage_linear_coef>{slope:.3f}</open_circuit_voltage_linear_coef>',
-        f'  <capacity>{capacity:.4f}</capacity>',
-        f'  <initial_charge>{capacity:.4f}</initial_charge>',
+        f'  <capacity>{n.capacity:.4f}</capacity>',
+        f'  <initial_charge>{n.capacity:.4f}</initial_charge>',
         f'  <resistance>{n.usual_sag / current:.5f}</resistance>',
         '  <smooth_current_tau>1.0</smooth_current_tau>',
         f'  <power_load>{current * (n.full - n.usual_sag):.2f}</power_load>',
-        '  <fix_issue_225>true</fix_issue_225>', '</plugin>'))
+        '  <fix_issue_225>true</fix_issue_225>', '</plugin>')
 
 
-def _ardupilot(n: _Numbers, full_current: float) -> str:
-    capacity = _capacity(n, full_current)
-    return '\n'.join((
+def _ardupilot(n: _Numbers) -> tuple[str, ...]:
+    return (
         f'# {SOURCES["ardupilot"]}', f'SIM_BATT_VOLTAGE {n.full:.2f}',
-        f'SIM_BATT_CAP_AH {capacity:.3f}', f'BATT_CAPACITY {1e3 * capacity:.0f}',
+        f'SIM_BATT_CAP_AH {n.capacity:.3f}', f'BATT_CAPACITY {1e3 * n.capacity:.0f}',
         f'BATT_LOW_VOLT {n.cells * _EMPTY:.2f}', f'BATT_CRT_VOLT {n.cells * _CRITICAL:.2f}',
         '# In the JSON of the frame (sim_vehicle.py --model NAME:frame.json):',
-        f'# "maxVoltage": {n.cells * 4.2:.1f}, "battCapacityAh": {capacity:.3f}, '
-        f'"refBatRes": {n.sag / full_current:.5f}'))
+        f'# "maxVoltage": {n.cells * 4.2:.1f}, "battCapacityAh": {n.capacity:.3f}, '
+        f'"refBatRes": {n.sag / n.current:.5f}')
 
 
-_WRITERS: dict[str, Callable[[_Numbers, float], str]] = {
-    'px4': _px4, 'gazebo': _gazebo, 'ardupilot': _ardupilot}
-
-
-def _omitted_terms(model: SupplyModel, target: str, throttle: FloatArray, rate: float
+def _omitted_terms(model: SupplyModel, kept: tuple[str, ...], throttle: FloatArray, rate: float
                    ) -> list[str]:
     """Return a line for each term that is left out, with its effect on the simulated voltage."""
-    whole = _simulated(model, throttle, rate)
-    notes = []
+    def simulated(one: SupplyModel) -> FloatArray:
+        return RunningSupply(one, rate=rate, seed=0).draw(throttle)
+
+    whole, notes = simulated(model), []
     for k, term in enumerate(model.terms):
-        if term.NAME in _KEPT[target]:
+        if term.NAME in kept:
             continue
         rest = (replace(model.ou, sigma=0.0), *model.terms[1:]) if k == 0 else (
             *model.terms[:k], *model.terms[k + 1:])
         # The random draws of a term do not depend on other terms: the difference is its effect.
-        moved = whole - _simulated(SupplyModel(rest, model.load), throttle, rate)
+        moved = whole - simulated(SupplyModel(rest, model.load))
         notes.append(f'{term.NAME} is left out; its effect: {1e3 * float(np.std(moved)):.3g} mV '
                      f'rms, up to {1e3 * float(np.abs(moved).max()):.3g} mV')
-    return notes
-
-
-def _simulated(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatArray:
-    return RunningSupply(model, rate=rate, seed=0).draw(throttle)
-
-
-def _explained_words(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
-    notes = []
-    for words, one in (('the model', model), ('the exported part', left)):
-        found = compare(recording, one, seeds=_SEEDS)
-        notes.append(
-            f'{words}: explains {100.0 * max(found.explained, 0.0):.0f} % of {recording.name}, '
-            f'lowest voltage {found.lowest.median:.2f} V (measured {found.lowest.measured:.2f} '
-            f'V). {found.verdict.value}')
     return notes
