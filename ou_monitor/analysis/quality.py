@@ -145,7 +145,7 @@ def _stamp_items(recording: Recording) -> list[QualityItem]:
     pauses = steps > GAP_STEPS * median
     if pauses.any():
         items.append(QualityItem('PAUSES', Severity.WARNING, (
-            f'{counted(int(pauses.sum()), "pause")} without samples, '
+            f'{counted(int(pauses.sum()), "pause")} without usable samples, '
             f'{float(steps[pauses].sum()):.3g} s in all, the longest '
             f'{float(steps.max()):.3g} s; no level spans a pause.')))
     if scatter := scatter_words(recording.t, _UNEVEN):

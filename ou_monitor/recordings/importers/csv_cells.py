@@ -256,7 +256,7 @@ _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 _COUNTS = 2.0**32
 # Maximum voltage of a pack, V. Without a unit, larger values are mV; whole numbers down to a tenth
 # of it may be ADC counts, and are refused.
-_MOST_VOLTS = 1000.0
+MOST_VOLTS = 1000.0
 # Peak above which a throttle without a unit is percent, not a lever's voltage of up to 5 V.
 _LEAST_PERCENT = 5.5
 
@@ -392,10 +392,10 @@ def in_si(path: Path, quantity: str, column: FileColumn, values: FloatArray, giv
     unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
     if not unit:
         usual = float(np.median(known)) if known.size else 0.0
-        if 0.1 * _MOST_VOLTS < usual <= _MOST_VOLTS and (known == np.rint(known)).all():
+        if 0.1 * MOST_VOLTS < usual <= MOST_VOLTS and (known == np.rint(known)).all():
             raise InputError(f"{path}: '{column.name}' has whole numbers about {usual:g} and no "
                              'stated unit: convert counts to V, or give --unit V or mV')
-        unit = 'mV' if usual > _MOST_VOLTS else 'V'
+        unit = 'mV' if usual > MOST_VOLTS else 'V'
         words = ', a guess: ' + '--voltage-column and ' * column.guess + '--unit'
     return values * SCALES[unit], unit + words
 

@@ -623,27 +623,34 @@ def _blocks(path: Path, file: TextIO, form: Form, width: int,
     reader = csv.reader(text, delimiter=form.delimiter, strict=True, skipinitialspace=True)
     while True:
         before = form.skip + reader.line_num
+        rows: list[list[str]] = []
         try:
-            rows = list(islice(reader, _BLOCK))
+            rows.extend(islice(reader, _BLOCK))
         except csv.Error as error:
-            raise InputError(f'{path}:{form.skip + reader.line_num}: {error}: close each quote '
-                             'in its line') from error
+            # `rows` holds the rows before the bad one.
+            first = before + 1 + sum(map(_lines_of, rows))
+            raise InputError(f'{path}:{first}: {error} in the row that begins there: close each '
+                             'quote in its line') from error
         if not rows:
             return
         lines: Sequence[int] = range(before + 1, before + 1 + len(rows))
         if form.skip + reader.line_num > lines[-1]:
-            lines = list(accumulate((1 + sum(cell.count('\n') for cell in row) for row in rows),
-                                    initial=before))[1:]
+            lines = list(accumulate(map(_lines_of, rows), initial=before))[1:]
             for line, row in zip(lines, rows):
                 if any(part.count(form.delimiter) >= width - 1
                        for cell in row for part in cell.splitlines()[1:]):
-                    raise InputError(f'{path}:{line}: whole lines before this one are within a '
-                                     'quote: close each quote in its line')
+                    raise InputError(f'{path}:{line + 1 - _lines_of(row)}: whole lines after this '
+                                     'one are within a quote: close each quote in its line')
         if form.comma and form.delimiter == ',':
             rows = [_joined(row, width) or list(map(_with_point, row)) for row in rows]
         if form.indent:
             rows = [_of_table(row, form.indent) for row in rows]
         yield lines, rows
+
+
+def _lines_of(row: list[str]) -> int:
+    """Return the number of lines that a row takes."""
+    return 1 + sum(cell.count('\n') for cell in row)
 
 
 def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:

@@ -24,8 +24,9 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
     AMPERE_WORDS, CHANNEL, clock_times, factor_of, FileColumn, has_day, in_si, is_clock,
-    is_missing, is_number, is_value, lower_rows, number_of, OTHER_WORDS, PULSE_WORDS, SCALES,
-    SHARE_WORDS, shown, stamps_of, TIME_WORDS, unit_of, unit_word, unwrapped, VOLT_WORDS, WORDS)
+    is_missing, is_number, is_value, lower_rows, MOST_VOLTS, number_of, OTHER_WORDS, PULSE_WORDS,
+    SCALES, SHARE_WORDS, shown, stamps_of, TIME_WORDS, unit_of, unit_word, unwrapped, VOLT_WORDS,
+    WORDS)
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
@@ -312,6 +313,11 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
         column_values = column_values * factor_of(column.name)
         si, guesses[quantity] = in_si(path, quantity, column, column_values,
                                       units.get(quantity), volts, guesses.get(logs.VOLTAGE, ''))
+        if quantity == logs.VOLTAGE and (form.delimiter, form.mark, wanted.decimal) == (
+                ',', '.', None) and (most := np.fmax.reduce(si, initial=0.0)) > MOST_VOLTS:
+            raise InputError(f"{path}: '{column.name}' reaches {most:.5g} V if commas within "
+                             'quotes separate thousands: give --decimal . if they do, else write '
+                             'points as decimal marks')
         if quantity == logs.THROTTLE and len(several) > 1:
             guesses[quantity] += f', mean of {len(several)} motors'
         scaled[quantity] = column, si
@@ -346,6 +352,9 @@ def _rest_of_group(form: Form, quantity: str, column: FileColumn, wanted: CsvCol
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
     """Return the error for a missing column."""
+    if name in form.names and (cells := form.cells(form.names.index(name))):
+        return (f"{path}:{form.skip + 1}: column '{name}' holds '{shown(cells[0])}', not a "
+                'number: is its decimal mark another than in the other columns?')
     if sum(len(row) != form.width for row in form.rows) > _BACK * len(form.rows):
         hint, option = ('its lines have different numbers of cells, as messages of several kinds '
                         'have: keep those of one kind in a file of their own'), ''
