@@ -17,16 +17,13 @@ as fast as the grid are averaged.  The usable band ends at a quarter of the lowe
 the spline attenuates by more than 3 %.  Limits: aliases of the original sampling remain, and a
 stamp error of e seconds gives a phase error of 2 pi f e.
 
-`measure_coherence` tests whether two series of any spectra are coherent.  Two tests must reject:
-
-- Each bin of each segment is divided by the rms of the signal over the bins around it, because a
-  manoeuvre changes the shape of the gyro spectrum.  If the signal is then white Gaussian, the
-  squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p), for
-  any voltage, with K segments and p causes (throttle and its square) regressed out (Halliday et
-  al., 1995).
-- The division does not whiten moving lines and bursts.  So the second test compares the sum over
-  bins and the largest bin with their values when the signs of blocks of neighbouring segments are
-  random (Freedman and Lane, 1983).
+`measure_coherence` tests whether two series of any spectra are coherent: the sum over bins and the
+largest bin are compared with their values when the signs of blocks of neighbouring segments are
+random (Freedman and Lane, 1983).  Each bin of each segment is divided by the rms of the signal
+over the bins around it, because a manoeuvre changes the shape of the gyro spectrum.  If the signal
+is then white Gaussian, the squared partial coherence of a bin exceeds c by chance with probability
+(1 - c)^(K - 1 - p), for any voltage, with K segments and p causes (throttle and its square)
+regressed out (Halliday et al., 1995): this gives the threshold and the detectable gain.
 
 Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
 in both series is detected although it is not coupling (`narrow`).
@@ -39,15 +36,18 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline import new_readings, repeats_words
+from ou_monitor.timeline import in_order, new_readings, repeats_words
 from scipy import stats
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.signal.windows import hann
 from scipy.special import chndtrinc
+
+ComplexArray = npt.NDArray[np.complex128]
 
 # Lower end of the band, Hz; stick inputs and discharge are slower.
 LOWEST = 5.0
@@ -63,28 +63,50 @@ POWER = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class Coupling:
+class Coherence:
+    """Share of a signal that a voltage explains, for each bin, with its test."""
+
+    p_value: float  # Family-wise, of the sum over bins and the largest bin
+    coherence: FloatArray  # Squared partial coherence, 0..1; shape (m,)
+    response: ComplexArray  # Signal units per volt; shape (m,)
+    # Power of the voltage over the power of the unexplained signal, in 1 / gain^2; shape (m,).
+    ratio: FloatArray
+    threshold: float  # Coherence that the largest bin must exceed
+    # Effective number of segments; that number less the fitted parameters.
+    segments: float
+    spare: float
+    narrow: bool  # Only a few bins are coherent, and the others contradict their gain
+    level: float  # Family-wise probability of a false alarm
+
+    @property
+    def seen(self) -> bool:
+        """Return whether there is coupling, at the family-wise `level`."""
+        return self.p_value <= self.level
+
+    @property
+    def limit(self) -> float:
+        """Return the gain that is detected with probability `POWER`, signal units per volt."""
+        ratio = self.ratio[::STRIDE]
+        freedom = 2 * ratio.size
+        needed = float(stats.chi2.isf(0.5 * self.level, freedom))
+        far = float(chndtrinc(needed, freedom, 1.0 - POWER))
+        per_gain = 2.0 * self.spare * float(ratio.sum())
+        return math.sqrt(far / per_gain) if per_gain > 0.0 else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling(Coherence):
     """Result of a coupling estimate."""
 
-    seen: bool  # Whether there is coupling, at the family-wise `level`
-    p_value: float  # Family-wise
     # Signal units per volt, signed, lag removed; NaN without coupling.
     gain: float
     gain_ci95: tuple[float, float]
     # Delay of the signal behind the voltage, s; NaN without coupling.
     lag: float
     lag_se: float
-    limit: float  # Gain that would be detected with probability `POWER`, signal units per volt
-    narrow: bool  # Whether only a few bins are coherent, as with a common line
     signal_leads: bool  # Whether the signal leads the voltage, by three standard errors
     noise_share: float  # Share of the signal's power in the band that the voltage explains
-    # Bins of the band, Hz; squared partial coherence; gain, signal units per volt; shape (m,).
-    frequency: FloatArray
-    coherence: FloatArray
-    response: ComplexArray
-    threshold: float  # Coherence that the largest bin must exceed
-    level: float  # Family-wise probability of a false alarm
-    segments: float  # Effective number of segments
+    frequency: FloatArray  # Bins of the band, Hz; shape (m,)
     partial: bool  # Whether throttle was regressed out
     grid: Grid  # Resampled series
     notes: tuple[str, ...]  # Cautions, one sentence each
@@ -145,14 +167,12 @@ def estimate_coupling(
     # A fixed seed: the same recording always gives the same result.
     found = measure_coherence(pieces[0], pieces[1], pieces[2:], level,
                               np.random.default_rng(0) if rng is None else rng)
-    seen = found.p_value <= level
-
     v, x, rest = _weighted(pieces)
     response = (np.conj(v) * x).sum(0) / (np.abs(v)**2).sum(0)
     gain = lag = lag_se = NAN
     share = 0.0
     interval = (NAN, NAN)
-    if seen:
+    if found.seen:
         share = 1.0 - float(rest.sum() / (np.abs(x)**2).sum())
         gain, lag = _fit(frequency, v, x, rest / count)
         # Weights by the whole signal favour segments in which its noise cancels the coupled part;
@@ -169,11 +189,11 @@ def estimate_coupling(
         known_by = (2.0 * gain**2 * (omega**2 * vv / density)[::STRIDE].sum()
                     * found.segments / count)
         lag_se = 1.0 / math.sqrt(known_by) if known_by > 0.0 else NAN
-    leads = bool(seen and lag < -3.0 * lag_se and lag < -0.25 / grid.rate)
+    leads = bool(found.seen and lag < -3.0 * lag_se and lag < -0.25 / grid.rate)
     return Coupling(
-        seen, found.p_value, gain, interval, lag, lag_se, found.limit(level, POWER),
-        found.narrow, leads, share, frequency, found.squared, response, found.threshold, level,
-        found.segments, len(pieces) > 2, grid, tuple(notes))
+        **{**vars(found), 'response': response}, gain=gain, gain_ci95=interval, lag=lag,
+        lag_se=lag_se, signal_leads=leads, noise_share=share, frequency=frequency,
+        partial=len(pieces) > 2, grid=grid, notes=tuple(notes))
 
 
 def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
@@ -206,13 +226,10 @@ def _weighted(pieces: list[ComplexArray]) -> tuple[ComplexArray, ComplexArray, F
 
 def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
     low, high = (LOWEST, grid.usable) if band is None else band
-    if not 0.0 < low < high:
+    if not 0.0 < low < high <= grid.usable * (1.0 + 1e-3):
         raise InputError(
-            f'the band {low:g}..{high:g} Hz is empty: the slower series has '
-            f'{min(grid.rates):.4g} Hz and is usable up to {grid.usable:.4g} Hz')
-    if high > grid.usable * (1.0 + 1e-3):
-        raise InputError(f'the band ends at {high:g} Hz, but the slower series has '
-                         f'{min(grid.rates):.4g} Hz and is usable up to {grid.usable:.4g} Hz')
+            f'no band {low:g}..{high:g} Hz: the slower series has {min(grid.rates):.4g} Hz and is '
+            f'usable up to {grid.usable:.4g} Hz')
     return low, high
 
 
@@ -232,20 +249,19 @@ def _segments(grid: Grid, length: int, low: float, high: float,
     if bins.sum() < 2:
         raise InputError(f'the band {low:g}..{high:g} Hz holds {int(bins.sum())} frequencies of '
                          f'segments of {length / grid.rate:.2g} s: widen it')
-    found: list[list[ComplexArray]] = [[] for _ in grid.runs[0]]
-    for run in grid.runs:
-        columns = list(run)
-        if len(columns) == 3:
-            # Motor load also follows the square of throttle.
-            columns.append(columns[2]**2)
-            if len(found) == 3:
-                found.append([])
-        for start in range(0, run[0].size - length + 1, max(1, length // 2)):
-            for out, column in zip(found, columns):
-                part = column[start:start + length]
-                out.append(np.fft.rfft(window * (part - part.mean()))[bins])
-    band = np.asarray(frequency[bins], dtype=np.float64)
-    return band, [np.array(out, dtype=np.complex128).reshape(-1, band.size) for out in found]
+    # Motor load also follows the square of throttle.
+    runs = [(*run, run[2]**2) if len(run) == 3 else run
+            for run in grid.runs if run[0].size >= length]
+
+    def coefficients(k: int) -> ComplexArray:
+        found = [np.empty((0, int(bins.sum())))]
+        for run in runs:
+            parts = sliding_window_view(run[k], length)[::length // 2]
+            parts = window * (parts - parts.mean(axis=1, keepdims=True))
+            found.append(np.fft.rfft(parts)[:, bins])
+        return np.concatenate(found).astype(np.complex128)
+
+    return frequency[bins], [coefficients(k) for k in range(len(runs[0]) if runs else 2)]
 
 
 def _fit(frequency: FloatArray, v: ComplexArray, x: ComplexArray, density: FloatArray,
@@ -272,11 +288,10 @@ def _gain(frequency: FloatArray, cross: ComplexArray, power: FloatArray, lag: fl
 def _jackknife(frequency: FloatArray, v: ComplexArray, x: ComplexArray, density: FloatArray,
                lag: float) -> tuple[float, float]:
     """Return the 95 % interval of the gain by a jackknife over blocks of segments."""
-    blocks = np.array_split(np.arange(v.shape[0]), _BLOCKS)
     turn = np.exp(2j * math.pi * frequency * lag)
-    above = np.array([(np.real(turn * np.conj(v[b]) * x[b]).sum(0) / density).sum()
-                      for b in blocks])
-    below = np.array([((np.abs(v[b])**2).sum(0) / density).sum() for b in blocks])
+    above, below = (
+        np.array([one.sum() for one in np.array_split((power / density).sum(1), _BLOCKS)])
+        for power in (np.real(turn * np.conj(v) * x), np.abs(v)**2))
     gain = float(above.sum() / below.sum())
     left = (above.sum() - above) / (below.sum() - below)
     spread = math.sqrt((_BLOCKS - 1) / _BLOCKS * float(((left - left.mean())**2).sum()))
@@ -319,13 +334,8 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
     clean: list[tuple[FloatArray, FloatArray]] = []
     lost, rates = [], []
     for name, (t, values) in series.items():
-        good = np.isfinite(t) & np.isfinite(values)
-        stamps, kept = t[good], values[good]
-        order = np.argsort(stamps, kind='stable')
-        stamps, kept = stamps[order], kept[order]
-        fresh = np.ones(stamps.size, dtype=bool)
-        fresh[1:] = np.diff(stamps) > 0.0
-        stamps, kept = stamps[fresh], kept[fresh]
+        which, _ = in_order(t, values[:, None], float(np.finfo(np.float64).max))
+        stamps, kept = t[which], values[which]
         if stamps.size < _LEAST_SAMPLES:
             raise InputError(f'{name} has {stamps.size} finite samples: at least {_LEAST_SAMPLES} '
                              'are needed')
@@ -334,10 +344,7 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
         clean.append((stamps, kept))
     slowest, fastest = min(rates), max(rates)
     rate = fastest if fastest <= _FASTEST * slowest else _STEPS * slowest
-    spans = [_spans(t, 1.0 / r) for (t, _), r in zip(clean, rates)]
-    shared = spans[0]
-    for other in spans[1:]:
-        shared = _intersection(shared, other)
+    shared = _shared([_spans(t, 1.0 / r) for (t, _), r in zip(clean, rates)])
     runs, begin = [], min(t[0] for t, _ in clean)
     for start, stop in shared:
         # One grid for all parts, so that a lag means the same in each.
@@ -354,26 +361,22 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
     return Grid(rate, 0.25 * slowest, runs, tuple(rates), tuple(lost), len(runs) - 1, span)
 
 
-def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:
-    """Return the parts without a gap: first and last stamp of each, s."""
+def _spans(t: FloatArray, step: float) -> FloatArray:
+    """Return the parts without a gap: first and last stamp of each, s; shape (parts, 2)."""
     breaks = np.flatnonzero(np.diff(t) > GAP * step)
-    starts = np.concatenate(([0], breaks + 1))
-    stops = np.concatenate((breaks, [t.size - 1]))
-    return [(float(t[a]), float(t[b])) for a, b in zip(starts, stops) if b - a >= _LEAST_SAMPLES]
+    starts, stops = np.append(0, breaks + 1), np.append(breaks, t.size - 1)
+    long = stops - starts >= _LEAST_SAMPLES
+    return np.stack((t[starts[long]], t[stops[long]]), axis=1)
 
 
-def _intersection(one: list[tuple[float, float]], other: list[tuple[float, float]],
-                  ) -> list[tuple[float, float]]:
-    found, i, j = [], 0, 0
-    while i < len(one) and j < len(other):
-        low, high = max(one[i][0], other[j][0]), min(one[i][1], other[j][1])
-        if high > low:
-            found.append((low, high))
-        if one[i][1] < other[j][1]:
-            i += 1
-        else:
-            j += 1
-    return found
+def _shared(spans: list[FloatArray]) -> FloatArray:
+    """Return the parts that all series cover."""
+    ends = np.concatenate(spans)
+    # A part ends where another begins: it ends first.
+    order = np.lexsort((np.tile((1, 0), len(ends)), ends.ravel()))
+    covered = np.cumsum(np.tile((1, -1), len(ends))[order])
+    begin = np.flatnonzero(covered == len(spans))
+    return np.stack((ends.ravel()[order][begin], ends.ravel()[order][begin + 1]), axis=1)
 
 
 def _sampled(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: float) -> FloatArray:
@@ -396,8 +399,6 @@ def _sampled(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: flo
     return spline
 
 
-ComplexArray = npt.NDArray[np.complex128]
-
 # Bins over which the power of the signal is averaged.
 _AROUND = 11
 # Neighbouring bins of the Hann window are correlated by 2/3, bins two apart by 1/6.
@@ -412,31 +413,6 @@ _DRAWS, _COUNTED = 499, 10
 _BLOCK, _SIGNED = 16, 16
 # Family-wise significance level at which a bin counts as coherent in `_is_narrow`.
 _LINE = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Coherence:
-    """Share of a signal that a voltage explains, for each bin, with its tests."""
-
-    p_value: float  # Family-wise, from two tests: the sum over bins and the largest bin
-    squared: FloatArray  # Squared partial coherence, 0..1; shape (m,)
-    response: ComplexArray  # Signal units per volt; shape (m,)
-    # Power of the voltage over the power of the unexplained signal, in 1 / gain^2; shape (m,).
-    ratio: FloatArray
-    threshold: float  # Coherence that the largest bin must exceed
-    # Effective number of segments; that number less the fitted parameters.
-    segments: float
-    spare: float
-    narrow: bool  # Only a few bins are coherent, and the others contradict their gain
-
-    def limit(self, level: float, power: float) -> float:
-        """Return the gain that the test of the sum would detect with probability `power`."""
-        ratio = self.ratio[::STRIDE]
-        freedom = 2 * ratio.size
-        needed = float(stats.chi2.isf(0.5 * level, freedom))
-        far = float(chndtrinc(needed, freedom, 1.0 - power))
-        per_gain = 2.0 * self.spare * float(ratio.sum())
-        return math.sqrt(far / per_gain) if per_gain > 0.0 else math.inf
 
 
 def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[ComplexArray],
@@ -457,13 +433,12 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
     squared = np.clip(np.abs(response)**2 * vv / xx, 0.0, 1.0 - 1e-12)
     ratio = share**2 * vv / np.maximum(xx - np.abs(response)**2 * vv, 1e-12 * xx)
     response = response / share
-    p_sum, p_max, threshold = chance(squared[::STRIDE], spare, level)
     tested = slice(None), slice(None, None, STRIDE)
-    drawn_sum, drawn_max = _sign_test(v[tested], whole[tested], [one[tested] for one in basis],
-                                      rng)
-    p_value = min(1.0, 2.0 * min(max(p_sum, drawn_sum), max(p_max, drawn_max)))
+    p_value = min(1.0, 2.0 * min(_sign_test(
+        v[tested], whole[tested], [one[tested] for one in basis], rng)))
     narrow = p_value <= level and _is_narrow(squared, response, ratio, spare)
-    return Coherence(p_value, squared, response, ratio, threshold, segments, spare, narrow)
+    return Coherence(p_value, squared, response, ratio, _threshold(squared, spare, level),
+                     segments, spare, narrow, level)
 
 
 def local_size(signal: ComplexArray) -> FloatArray:
@@ -507,13 +482,10 @@ def without(y: ComplexArray, basis: list[ComplexArray]) -> ComplexArray:
     return rest
 
 
-def chance(squared: FloatArray, spare: float, level: float) -> tuple[float, float, float]:
-    """Return the p-values of the sum and of the largest bin, and the threshold of that bin."""
-    information = -spare * np.log1p(-squared)
-    p_sum = float(stats.gamma.sf(information.sum(), squared.size))
-    p_max = -math.expm1(squared.size * math.log1p(-math.exp(-float(information.max()))))
-    alone = -math.expm1(math.log1p(-0.5 * level) / squared.size)
-    return p_sum, p_max, -math.expm1(math.log(alone) / spare)
+def _threshold(squared: FloatArray, spare: float, level: float) -> float:
+    """Return the coherence that the largest bin exceeds by chance with probability level / 2."""
+    alone = -math.expm1(math.log1p(-0.5 * level) / squared[::STRIDE].size)
+    return -math.expm1(math.log(alone) / spare)
 
 
 def _sign_test(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
@@ -560,9 +532,9 @@ def _tail(drawn: FloatArray, law: str) -> float:
 def _is_narrow(squared: FloatArray, response: ComplexArray, ratio: FloatArray, spare: float
                ) -> bool:
     """Return whether only a few bins are coherent and the others contradict their gain."""
-    loud = squared > chance(squared[::STRIDE], spare, _LINE)[2]
+    loud = squared > _threshold(squared, spare, _LINE)
     # A line spreads over the main lobe of the window and its first side lobes.
-    near = np.convolve(loud, np.ones(9), 'same') > 0
+    near = maximum_filter1d(loud.astype(np.int8), 9) > 0
     left = np.flatnonzero(~near)[::STRIDE]
     if not loud.any() or left.size < 0.25 * squared.size:
         return False
@@ -570,4 +542,4 @@ def _is_narrow(squared: FloatArray, response: ComplexArray, ratio: FloatArray, s
     far = 2.0 * spare * gain**2 * float(ratio[left].sum())
     needed = stats.chi2.isf(0.02, 2 * left.size)
     return bool(stats.ncx2.sf(needed, 2 * left.size, far) > 0.95
-                and chance(squared[left], spare, _LINE)[0] > 0.02)
+                and stats.gamma.sf(-spare * np.log1p(-squared[left]).sum(), left.size) > 0.02)
