@@ -4,8 +4,7 @@ Compare a recording with simulations of it under the recorded throttle.
 Limits: the only input of the fitted model is throttle or current; the bands include errors of its
 parameters, estimated from held-out parts, but not later changes of the craft.
 
-The two low levels lie halfway between two codes of the ADC, so that no reading equals them.  Dips
-below a level are counted with hysteresis, as in `supply_facts`.
+Dips below a level are counted with hysteresis, as in `supply_facts`.
 
 The score of a number is its distance from the median, in half-widths of a band that is estimated
 from the simulations and the recording; the half-width is at least a difference that a pilot would
@@ -240,16 +239,14 @@ _BINS = 2000
 class Yardstick:
     """Levels, frequency bands and rises of a recording, by which voltages are compared."""
 
-    def __init__(self, samples: Recording, lsb: float, limits: tuple[float, ...] = (),
-                 code: float = 0.0) -> None:
-        # lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones; code:
-        # one code of the ADC, V.
+    def __init__(self, samples: Recording, lsb: float, limits: tuple[float, ...] = ()) -> None:
+        # lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones.
         v, t = samples.voltage, samples.t
         self._t = t
         self._minutes = float(t[-1] - t[0]) / 60.0
-        low = dict.fromkeys(between_codes(float(np.quantile(v, share)), lsb, code)
-                            for share in LOW_SHARES)
-        self.levels = [*limits, *low]
+        # Levels between two codes of the ADC, so that no reading equals them.
+        low = dict.fromkeys(np.quantile(v, LOW_SHARES, method='lower').tolist())
+        self.levels = [*limits, *(code + 0.5 * lsb for code in low)]
         flown, left = without_wild(samples, remainder(samples))
         self._rise = rise_that_ends(v, samples.throttle, noise_of(flown, left))
         self._rate = 1.0 / float(np.median(np.diff(t)))
@@ -316,11 +313,6 @@ def _lasting_line(rest: FloatArray, rate: float) -> Line | None:
     return max((one for one in first if any(
         abs(one.frequency - other.frequency) < one.resolution + other.resolution
         for other in second)), key=lambda line: line.rms, default=None)
-
-
-def between_codes(level: float, lsb: float, code: float = 0.0) -> float:
-    """Return the midpoint between the two codes around a level, V (code: any code)."""
-    return code + (np.floor((level - code) / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
 
 
 def _rise_times(t: FloatArray, throttle: FloatArray) -> npt.NDArray[np.float64]:
@@ -415,7 +407,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
 
     own = part_of(samples, slice(begin, None))
     own = replace(own, voltage=read(own.voltage))
-    yardstick = Yardstick(own, lsb, levels, code)
+    yardstick = Yardstick(own, lsb, levels)
     stride = -(-own.n // _PLOTTED)
     # A model from a file has the level of another flight.
     aligned = slice(0) if model is None else _beginning(own.t, np.array([

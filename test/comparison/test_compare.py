@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.comparison.compare import (
-    Agreement, between_codes, compare, ComparedNumber, judge, Likeness, rows_of, Yardstick)
+    Agreement, compare, ComparedNumber, judge, Likeness, rows_of, Yardstick)
 from ou_monitor.comparison.flight_model import (
     _sag_error, damping, fit_flight, fit_noise, FlightNoise)
 from ou_monitor.errors import InputError
@@ -444,9 +444,6 @@ def test_white_noise_has_equal_power_in_equal_bands():
 
 
 def test_levels_lie_between_codes():
-    assert between_codes(14.15, 0.01) == pytest.approx(14.155)
-    assert between_codes(14.153, 0.0) == 14.153
-    assert between_codes(14.154, 0.01, 14.004) == pytest.approx(14.159)
     coarse = white(3)
     coarse = Recording(coarse.t, 0.1 * np.rint(coarse.voltage / 0.1))
     levels = Yardstick(coarse, 0.1).levels
