@@ -132,22 +132,17 @@ def full_voltage(recording: Recording) -> float:
     return float(np.median(whole, axis=1).max())
 
 
-def _usual_cells(full: float) -> tuple[int, ...]:
-    """Return the numbers of cells that are full to half full at this voltage at rest, V."""
-    return tuple(n for n in range(1, _MOST_GUESSED + 1) if _HALF <= full / n <= FULL_CELL)
-
-
 def likely_cells(full: float) -> tuple[int, ...]:
     """Return the numbers of cells that a voltage at rest, V, cannot tell apart."""
-    return _usual_cells(full) or tuple(sorted(
-        (n for n in range(1, _MOST_GUESSED + 1) if _PACK <= full / n <= HIGHEST_CELL),
-        key=lambda n: abs(full / n - 0.5 * (_HALF + FULL_CELL)))[:1])
+    possible = [n for n in range(1, _MOST_GUESSED + 1) if _PACK <= full / n <= HIGHEST_CELL]
+    return tuple(n for n in possible if _HALF <= full / n <= FULL_CELL) or tuple(
+        sorted(possible, key=lambda n: abs(full / n - 0.5 * (_HALF + FULL_CELL)))[:1])
 
 
 def cells_among(full: float, known: Iterable[int]) -> int:
     """Return which number of a vehicle's flights one with this voltage at rest has; 0: unknown."""
     # A flight that ends an empty pack begins below any usual voltage.
-    usual = bool(_usual_cells(full))
+    usual = any(full / n <= FULL_CELL for n in likely_cells(full))
     fit = [n for n in known if (_PACK if usual else _BEGINS) <= full / n <= HIGHEST_CELL]
     return 0 if usual and len(fit) > 1 else max(fit, default=0)
 

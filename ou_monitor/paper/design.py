@@ -134,12 +134,8 @@ class Design:
     # With the smallest capacitance above which every capacitance meets the target; None: none
     # does, or all do and the present one too.
     least: DesignRow | None
-    doubled: DesignRow  # With twice the present capacitance.
     rows: tuple[DesignRow, ...]  # One row for each capacitance tried, rising.
     falls: bool  # Whether the risk never rises with capacitance in the table.
-    # Battery resistance at which the mean of the bus is at the level, Ohm; NaN if there is none or
-    # the rail is regulated.
-    resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
     sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
     assumed: bool = False  # Whether the battery resistance is assumed, and so shown in %
@@ -254,9 +250,7 @@ def design(
     found = Design(
         network=network, rail=rail, throttle=throttle, voltage=voltage, horizon=horizon,
         target=risk, esr_follows=esr_follows, verdict=verdict, present=present, least=least,
-        doubled=at(2.0 * present.capacitance), rows=tuple(rows),
-        falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
-        resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
+        rows=tuple(rows), falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         levers=(), sag_error=sag_error, assumed=assumed)
     return replace(found, levers=_levers(found, at, flown))
 
@@ -330,14 +324,6 @@ def _least(at: Callable[[float], DesignRow], rows: list[DesignRow],
         lambda log: at(math.exp(log)).rate <= allowed, high, low, 1e-12)))
 
 
-def _resistance(network: PowerNetwork, throttle: float, voltage: float) -> float:
-    """Return the battery resistance at which the mean of the bus is `voltage`, Ohm."""
-    current = network.current_at(throttle) + network.regulator_power / voltage
-    if current == 0.0 or voltage >= network.battery_voltage:
-        return math.nan
-    return (network.battery_voltage - voltage) / current
-
-
 def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
     """Return the result for JSON; `taken` describes the values from a flight, if any."""
     def row(r: DesignRow | None) -> dict[str, float] | None:
@@ -349,8 +335,7 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
         'horizon_s': result.horizon, 'target_risk': result.target,
         'esr_follows': result.esr_follows, 'verdict': result.verdict.name.lower(),
         'answer': answer(result), 'effect': effect(result), 'present': row(result.present),
-        'least': row(result.least), 'resistance_at_level': result.resistance,
-        'levers': [asdict(lever) for lever in result.levers],
+        'least': row(result.least), 'levers': [asdict(lever) for lever in result.levers],
         'risk_falls_with_capacitance': result.falls,
         'rows': [row(r) for r in result.rows], 'measured': taken or None}
 
@@ -371,16 +356,12 @@ def answer(result: Design) -> str:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
                 f'the risk under {result.target:g}: with the largest it is still '
                 f'{probability(result.rows[-1].risk)}. {_others(result)}')
-    ratio = result.resistance / result.network.battery_resistance
-    cure = ('The mean is above the level with less than ' + (
-        f'{percent(ratio)} of the resistance.' if result.assumed else
-        f'{1e3 * result.resistance:.3g} mOhm of {result.levers[-2].name}.')
-            if math.isfinite(result.resistance) else
-            'The level is at or above the open-circuit voltage: check cells and battery_voltage, '
-            'or lower the level.' if result.rail == 'bus' else
-            'Raise regulator_voltage or lower the level.')
+    cure = (' Raise regulator_voltage or lower the level.' if result.rail != 'bus' else
+            '' if result.voltage < result.network.battery_voltage else
+            ' The level is at or above the open-circuit voltage: check cells and battery_voltage, '
+            'or lower the level.')
     return (f'No capacitor helps: the mean, {present.mean:.4g} V, is at or below '
-            f'{result.voltage:g} V. {_others(result)} {cure}')
+            f'{result.voltage:g} V. {_others(result)}{cure}')
 
 
 def _others(result: Design) -> str:
@@ -397,17 +378,11 @@ def _others(result: Design) -> str:
 
 
 def effect(result: Design) -> str:
-    """Return the effect of adding capacitance, in words."""
+    """Return the effect of the least or the largest capacitance, in words."""
     a = result.present
     if a.var_inf == 0.0:
         return 'There is no noise at this throttle.'
-    if result.verdict is DesignVerdict.FOUND and result.least is not None:
-        b = result.least
-    elif (result.verdict is DesignVerdict.OUT_OF_RANGE
-          and result.rows[-1].capacitance > a.capacitance):
-        b = result.rows[-1]
-    else:
-        b = result.doubled
+    b = result.least or result.rows[-1]
     text = (f'From {_uf(a)} to {_uf(b)}: alpha {_change(a.alpha, b.alpha, " 1/s")}, Var_inf '
             f'{_change(a.var_inf, b.var_inf, " V^2")}, sigma '
             f'{_change(a.sigma, b.sigma, " V/sqrt(s)")}, risk {_change(a.risk, b.risk)}.')

@@ -70,8 +70,8 @@ def test_all_risks_are_those_of_the_flight():
     assert found.rows[-1].risk <= bulk.risk < found.present.risk
     enough = design(PowerNetwork(), 0.1, **{**QUESTION, 'risk': 0.01}, flown=flown)
     assert enough.verdict is DesignVerdict.ENOUGH
-    noise = enough.doubled.var_inf / enough.present.var_inf
-    assert enough.doubled.risk == pytest.approx(flown(0.1, 1.0, noise)) and noise < 0.9
+    noise = enough.rows[-1].var_inf / enough.present.var_inf
+    assert enough.rows[-1].risk == pytest.approx(flown(0.1, 1.0, noise)) and noise < 0.9
     assert all(lever.least == lever.present for lever in enough.levers)
 
 
@@ -92,18 +92,16 @@ def test_a_fixed_esr_may_leave_no_capacitance():
         assert ('does not always lower the risk' in said) is not falls
 
 
-def test_no_capacitor_helps_below_the_level_and_the_resistance_that_would_is_named():
+def test_no_capacitor_helps_below_the_level():
     result = design(PowerNetwork(), 0.9, **QUESTION)
     assert result.verdict is DesignVerdict.LEVEL and result.least is None
     assert result.present.risk == 1.0 and result.present.mean_time == 0.0
-    there = PowerNetwork(battery_resistance=result.resistance)
-    assert rail_at(there, 0.9).mean == pytest.approx(19.8, rel=1e-12)
-    assert f'less than {1e3 * result.resistance:.3g} mOhm' in answer(result)
+    assert 'open-circuit' not in answer(result)
 
 
-def test_a_level_above_the_battery_has_no_resistance():
+def test_a_level_above_the_battery_is_said_so():
     result = design(PowerNetwork(), 0.4, voltage=23.0, horizon=5.0, risk=1e-3)
-    assert result.verdict is DesignVerdict.LEVEL and math.isnan(result.resistance)
+    assert result.verdict is DesignVerdict.LEVEL
     assert 'open-circuit' in answer(result)
     regulated = design(PowerNetwork(), 0.4, rail='regulated', voltage=5.0, horizon=5.0, risk=1e-3)
     assert regulated.verdict is DesignVerdict.LEVEL and 'regulator_voltage' in answer(regulated)
