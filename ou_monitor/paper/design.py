@@ -334,7 +334,7 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
         'brownout_voltage': result.voltage, 'brownout_voltage_source': source,
         'horizon_s': result.horizon, 'target_risk': result.target,
         'esr_follows': result.esr_follows, 'verdict': result.verdict.name.lower(),
-        'answer': answer(result), 'effect': effect(result), 'present': row(result.present),
+        'answer': answer(result), 'present': row(result.present),
         'least': row(result.least), 'levers': [asdict(lever) for lever in result.levers],
         'risk_falls_with_capacitance': result.falls,
         'rows': [row(r) for r in result.rows], 'measured': taken or None}
@@ -375,28 +375,6 @@ def _others(result: Design) -> str:
                      'cells, or ') if result.network.cells else ('', '')
     return (f'Neither {packs}{percent(_RESISTANCE)} of the resistance, nor {percent(_THROTTLE)} '
             f'of the throttle would be enough: {charge}allow a lower voltage.')
-
-
-def effect(result: Design) -> str:
-    """Return the effect of the least or the largest capacitance, in words."""
-    a = result.present
-    if a.var_inf == 0.0:
-        return 'There is no noise at this throttle.'
-    b = result.least or result.rows[-1]
-    text = (f'From {_uf(a)} to {_uf(b)}: alpha {_change(a.alpha, b.alpha, " 1/s")}, Var_inf '
-            f'{_change(a.var_inf, b.var_inf, " V^2")}, sigma '
-            f'{_change(a.sigma, b.sigma, " V/sqrt(s)")}, risk {_change(a.risk, b.risk)}.')
-    if b.alpha < a.alpha and b.var_inf < a.var_inf:
-        text += ' The rail returns more slowly, but deviates less.'
-    return text
-
-
-def _change(a: float, b: float, unit: str | None = None) -> str:
-    """Return the change of a value in words; without a unit, it is a risk."""
-    first, second = (probability(v) if unit is None else number(v) for v in (a, b))
-    if first == second:
-        return f'stays at {first}{unit or ""}'
-    return f'{"falls" if b < a else "rises"} from {first} to {second}{unit or ""}'
 
 
 def _uf(row: DesignRow) -> str:

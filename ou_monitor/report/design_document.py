@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from ou_monitor.paper.design import (
-    answer, Design, effect, Flight, probability)
+from ou_monitor.paper.design import answer, Design, Flight, probability
 from ou_monitor.paper.network import PowerNetwork
 from ou_monitor.report.document import Document, Figure, Table, Text
 from ou_monitor.report.svg import Plot
@@ -54,7 +53,7 @@ def design_document(result: Design, source: str, taken: str = '') -> Document:
                 lever.words(lever.least) if math.isfinite(lever.least) else 'out of reach']
                for lever in result.levers],
               left=[0, 1]),
-        *map(Text, (effect(result), '' if result.falls else
+        *map(Text, ('' if result.falls else
                     'More capacitance does not always lower the risk here (ESR): choose a value '
                     'from the table.', taken))])
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.design import (
-    answer, design, DesignVerdict, effect, row_of, with_capacitance)
+    answer, design, DesignVerdict, row_of, with_capacitance)
 from ou_monitor.paper.network import PowerNetwork, rail_at
 from ou_monitor.report.design_document import design_document
 from ou_monitor.report.terminal import terminal
@@ -31,9 +31,8 @@ def test_adding_a_capacitor_lowers_alpha_and_the_variance():
     table = np.array([[r.alpha, r.var_inf, r.risk] for r in result.rows])
     assert (np.diff(table, axis=0) <= 0.0).all() and result.falls
     assert {(r.sag, r.mean) for r in result.rows} == {(result.present.sag, result.present.mean)}
-    words = effect(result)
-    assert 'alpha falls from 30391' in words and 'Var_inf falls from 0.161' in words
-    assert 'risk falls from 1.0 to 0.0010' in words and 'more slowly' in words
+    assert result.present.alpha == pytest.approx(30391.0, rel=1e-4)
+    assert result.present.var_inf == pytest.approx(0.161, rel=1e-2)
 
 
 def test_a_row_is_the_ou_of_the_rail():
@@ -86,7 +85,7 @@ def test_a_fixed_esr_may_leave_no_capacitance():
     assert result.verdict is DesignVerdict.OUT_OF_RANGE and result.least is None
     assert 'What would help: 2 packs in parallel' in answer(result)
     wide = design(PowerNetwork(), 0.4, esr_follows=False, capacitances=(10e-6, 0.1), **QUESTION)
-    assert 'alpha rises' in effect(wide)
+    assert wide.rows[-1].alpha > wide.present.alpha
     for falls in (True, False):
         said = terminal(design_document(replace(wide, falls=falls), 'given'))
         assert ('does not always lower the risk' in said) is not falls
@@ -111,7 +110,7 @@ def test_without_throttle_there_is_no_noise():
     result = design(PowerNetwork(), 0.0, **QUESTION)
     assert result.verdict is DesignVerdict.ENOUGH and result.present.risk == 0.0
     assert math.isinf(result.present.mean_time) and result.present.sigma == 0.0
-    assert effect(result) == 'There is no noise at this throttle.'
+    assert result.present.var_inf == 0.0
 
 
 @pytest.mark.parametrize('changed, words', [
