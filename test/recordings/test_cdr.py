@@ -367,17 +367,6 @@ def test_paths_that_the_type_does_not_have(options, words):
         reader_of(FieldSpec('/v', KIND, **{'field': 'x', **options}), TREE)
 
 
-def test_units_and_stamps():
-    spec = FieldSpec('/v', KIND, 'n[1].mv', sign=-1, unit_factor=1e-3, offset=0.5, stamp_field='t')
-    rest = {'d': [], 'x': 0.0, 's': ''}
-    messages = [encode(KIND, {'n': [{'mv': 1}, {'mv': 4200}][:k],
-                              't': {'sec': 12, 'nanosec': 250_000_000}, **rest}, TREE)
-                for k in (2, 1, 2)]
-    column, _ = read_all(spec, messages, text=TREE)
-    np.testing.assert_array_equal(column.values, [-4.2 + 0.5, np.nan, -4.2 + 0.5])
-    assert column.stamp.tolist() == [12.25] * 3
-
-
 def test_a_signalling_nan_gives_no_warning():
     """Of which NumPy warns where it is scaled or widened, and a warning is an error here."""
     spec = FieldSpec('x', KIND, 'x', unit_factor=0.1)

@@ -110,7 +110,7 @@ def test_a_binary_file_named_csv_is_refused(tmp_path):
 def test_repairs_are_noted(tmp_path):
     """Not finite: dropped. Unsorted: sorted. Repeated: the first kept. Each is counted."""
     text = ('time_s,voltage_v,throttle\n0,5.0,0.0\n2,5.2,\n1,5.1,inf\n1,9.9,0.5\n'
-            '3,NaN,0.5\n4,inf,0.5\n5,,0.5\ninf,5,0.5\n6,5.6,0.6\n')
+            '3,NaN,0.5\n4,1e300,0.5\n5,,0.5\ninf,5,0.5\n6,5.6,0.6\n')
     recording = read_recording(written(tmp_path, text))
     assert recording.t.tolist() == [0.0, 1.0, 2.0, 6.0]
     assert recording.voltage.tolist() == [5.0, 5.1, 5.2, 5.6]

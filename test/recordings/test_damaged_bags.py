@@ -9,8 +9,8 @@ import time
 
 import lz4.frame
 from made_bags import (
-    by_hand, channel, chunk, COUNT, message, messages, MS, Op, record, records, schema, START,
-    supply, text, WAYS, write)
+    by_hand, channel, chunk, COUNT, HEAD, message, messages, MS, Op, record, records, schema,
+    START, supply, text, WAYS, write)
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
@@ -403,6 +403,7 @@ def test_two_definitions_of_one_type(tmp_path):
 
 N = 100
 GB = 2**30
+SOUND = schema() + channel() + messages(N)
 
 
 def zeros(compressor):
@@ -421,12 +422,6 @@ def lz4_bomb():
     return frame.begin() + zeros(frame)
 
 
-def test_a_file_made_by_hand_is_read(tmp_path):
-    """The following tests change one thing in it each, and expect that error."""
-    path = by_hand(tmp_path / 'a.mcap', chunk(schema() + channel() + messages(N)))
-    assert read_recording(path).n == N
-
-
 @pytest.mark.parametrize('compression, packed', [
     ('zstd', lambda: zeros(zstd())), ('zstd', lambda: zeros(zstd(size=2 * GB))),
     ('lz4', lz4_bomb), ('lz4', lambda: lz4.frame.LZ4FrameCompressor().begin()),
@@ -434,7 +429,7 @@ def test_a_file_made_by_hand_is_read(tmp_path):
 @pytest.mark.parametrize('stated', [N, 2 * GB])
 def test_a_chunk_that_unpacks_to_more(tmp_path, monkeypatch, compression, packed, stated):
     """Neither a stated nor an actual size beyond the limit is unpacked; memory does not grow."""
-    path = by_hand(tmp_path / 'a.mcap', schema(), channel(), messages(N), chunk(
+    path = by_hand(tmp_path / 'a.mcap', SOUND, chunk(
         b'', compression=compression, packed=packed(), stated=stated))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if stated != N:
@@ -447,7 +442,7 @@ def test_a_chunk_that_unpacks_to_more(tmp_path, monkeypatch, compression, packed
 
 
 def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
-    path = by_hand(tmp_path / 'a.mcap', chunk(schema() + channel() + messages(N)))
+    path = by_hand(tmp_path / 'a.mcap', chunk(SOUND))
     assert BagReader(path).message_count == N
     monkeypatch.setattr(mcap_file, '_chunk_limit', lambda size: 1000)
     assert '0.001 MB is the limit' in complaint(BagReader, path)
@@ -457,7 +452,7 @@ def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
         2**26, 256 * 300_000, 10**8]
 
 
-def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
+def index_of(chunk_at=len(HEAD), *, chunk_length, unpacked, index_length=0, offset=None):
     behind = (chunk_at + chunk_length) % 2**64
     offsets = struct.pack('<HQ', 1, behind if offset is None else offset)
     return record(Op.CHUNK_INDEX, struct.pack('<QQQQ', 1000, 1000 * N, chunk_at, chunk_length),
@@ -468,6 +463,15 @@ def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
 def statistics():
     return record(Op.STATISTICS, struct.pack('<QHIIIIQQ', N, 1, 1, 0, 0, 1, 1000, 1000 * N),
                   text(struct.pack('<HQ', 1, N)))
+
+
+def indexed(path, content, *parts, index=b'', definitions=None, times=1, n=N, **lies):
+    """Write a chunk, its message index, and a summary, in which anything may be wrong."""
+    one = chunk(content, n=n)
+    place = {'chunk_length': len(one), 'unpacked': len(content), 'index_length': len(index),
+             **lies}
+    return by_hand(path, one, index, *parts, summary=b''.join([
+        definitions or schema() + channel(), index_of(**place) * times, statistics()]))
 
 
 LIES = {
@@ -481,12 +485,7 @@ LIES = {
 @pytest.mark.parametrize('lie', LIES)
 @pytest.mark.parametrize('times', [1, 50])
 def test_false_index_is_refused(tmp_path, lie, times):
-    one = chunk(schema() + channel() + messages(N))
-    at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
-    place = {'chunk_at': at, 'chunk_length': len(one), 'unpacked': len(one) - 9 - 40,
-             **LIES[lie]}
-    summary = schema() + channel() + index_of(**place) * times + statistics()
-    path = by_hand(tmp_path / 'a.mcap', one, summary=summary)
+    path = indexed(tmp_path / 'a.mcap', SOUND, times=times, **LIES[lie])
     began = time.process_time()
     try:
         assert read_recording(path).n == N
@@ -500,7 +499,7 @@ def test_false_index_is_refused(tmp_path, lie, times):
 
 def test_much_metadata_is_read_in_part(tmp_path):
     big = record(Op.METADATA, text('ou_monitor'), text(text('vehicle') + text('#' * 900_000)))
-    path = by_hand(tmp_path / 'a.mcap', *[big] * 50, chunk(schema() + channel() + messages(N)))
+    path = by_hand(tmp_path / 'a.mcap', *[big] * 50, chunk(SOUND))
     began = time.process_time()
     bag = BagReader(path)
     assert time.process_time() - began < 15.0
@@ -527,29 +526,19 @@ PLACES = [FIRST + STEP * k for k in range(N)]
     pairs(*PLACES) + b'\x00' * 9])
 def test_a_message_index_is_verified_or_left(tmp_path, index):
     """Places outside, twice, beside messages or incomplete: the chunk itself is asked instead."""
-    one = chunk(schema() + channel() + messages(N))
-    at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
-    summary = schema() + channel() + index_of(
-        at, len(one), FIRST + STEP * N, index_length=len(index)) + statistics()
-    path = by_hand(tmp_path / 'a.mcap', one, index, summary=summary)
+    path = indexed(tmp_path / 'a.mcap', SOUND, index=index)
     assert read_recording(path).voltage.tolist() == (5.0 + np.arange(N)).tolist()
 
 
 @pytest.mark.parametrize('length', [2**63 - 1, 2**63, 2**64 - 1, 2**64 - 9, 2**31, 21, 0])
 def test_a_length_within_a_chunk(tmp_path, length):
-    content = bytearray(schema() + channel() + messages(N))
+    content, index = bytearray(SOUND), pairs(*PLACES)
     struct.pack_into('<Q', content, PLACES[2] + 1, length)
-    one = chunk(bytes(content))
-    at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
-    index = pairs(*PLACES)
-    summary = schema() + channel() + index_of(
-        at, len(one), len(content), index_length=len(index)) + statistics()
-    for given in (summary, b''):
-        path = by_hand(tmp_path / 'a.mcap', one, index, summary=given)
+    for path in (indexed(tmp_path / 'a.mcap', bytes(content), index=index),
+                 by_hand(tmp_path / 'b.mcap', chunk(bytes(content)), index)):
         assert 'cut off' in (line := complaint(read_recording, path)) or 'shorter' in line
 
 
-SOUND = schema() + channel() + messages(N)
 OTHER = schema(definition='float32 more\nfloat32 data\n')
 BOMB = message(0, bytes(2**20 - 100), 1)
 
@@ -574,9 +563,7 @@ def test_what_is_refused(tmp_path, monkeypatch, parts, words):
 
 def test_a_second_definition_in_the_summary(tmp_path):
     """A schema that becomes another one is never taken for the first."""
-    one, first = chunk(SOUND), len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
-    summary = OTHER + channel() + index_of(first, len(one), FIRST + STEP * N) + statistics()
-    path = by_hand(tmp_path / 'a.mcap', one, summary=summary)
+    path = indexed(tmp_path / 'a.mcap', SOUND, definitions=OTHER + channel())
     assert 'defined a second time' in complaint(read_recording, path)
 
 
@@ -593,11 +580,8 @@ def test_what_is_left_out(tmp_path, parts, notes):
 
 
 def test_messages_outside_of_chunks(tmp_path):
-    part = messages(N)[:STEP * 60]
-    one = chunk(schema() + channel() + part, n=60)
-    at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
-    summary = schema() + channel() + index_of(at, len(one), FIRST + len(part)) + statistics()
-    path = by_hand(tmp_path / 'a.mcap', one, messages(N)[STEP * 60:], summary=summary)
+    end = PLACES[60]
+    path = indexed(tmp_path / 'a.mcap', SOUND[:end], SOUND[end:], n=60)
     assert read_recording(path).n == N
 
 
@@ -659,7 +643,7 @@ def test_endless_message_is_refused(tmp_path, definition, data):
     message(0, bytes(12)) + record(0x80)], ids=['private', 'broken', 'undefined', 'runs'])
 def test_much_of_it_takes_no_time(tmp_path, junk):
     """Time and notes grow no faster than the file, whatever it is full of."""
-    path = by_hand(tmp_path / 'a.mcap', schema(), channel(), messages(N), junk * 30_000)
+    path = by_hand(tmp_path / 'a.mcap', SOUND, junk * 30_000)
     began = time.process_time()
     bag = BagReader(path, partial=True)
     assert time.process_time() - began < 20.0

@@ -131,10 +131,12 @@ def chunk(content, *, n=100, compression='', packed=None, stated=None, crc=None)
         struct.pack('<Q', len(packed)), packed)
 
 
+HEAD = MAGIC + record(Op.HEADER, text('ros2'), text(''))
+
+
 def by_hand(path, *parts, summary=b''):
     """Write a file, whose summary may lie."""
-    head = MAGIC + record(Op.HEADER, text('ros2'), text('')) + b''.join(parts) + record(
-        Op.DATA_END, bytes(4))
+    head = HEAD + b''.join(parts) + record(Op.DATA_END, bytes(4))
     start = len(head) if summary else 0
     path.write_bytes(head + summary + record(Op.FOOTER, struct.pack('<QQI', start, 0, 0)) + MAGIC)
     return path

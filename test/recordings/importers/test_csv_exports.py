@@ -549,11 +549,23 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     ('time,U\n235958,12\n235959,13\n0,14\n1,13\n', CsvColumns(), 1.0, [12, 13, 14, 13]),
     # Excel's mm:ss.0 drops the hours.
     ('Time,V\n59:59.0,12\n59:59.5,13\n00:00.0,14\n', CsvColumns(), 0.5, [12, 13, 14]),
+    # A date and a clock are one time.
+    ('Datum;Uhrzeit;U\n16.05.2024;23:59:59,5;12\n19.05.2024;00:00:00,5;13\n'
+     '19.05.2024;00:00:02,0;14\n', CsvColumns(), [172801.0, 1.5], [12, 13, 14]),
+    # Excel in German: dates and clocks keep their points, of which a number is in thousands.
+    ('Zeit;U [mV]\n27.11.2026 10:15:23.125;24.674\n27.11.2026 10:15:23.250;1.024.673,5\n',
+     CsvColumns(decimal=','), 0.125, [24.674, 1024.6735]),
+    # A point elsewhere shows that quoted commas separate thousands.
+    (table(['time_s,U (mV)'], lambda k: f'{k / 100},"12,{k:03}"'), CsvColumns(), 0.01,
+     12.0 + 1e-3 * K),
+    # UTF-16 without a mark of its byte order.
+    (table(['Zeit;Spannung [V]'], lambda k: f'{german(k / 8)};{german(V[k])}').encode('utf-16-le'),
+     CsvColumns(), 0.125, V),
 ])
-def test_a_guess_is_overruled(content, columns, step, volts, tmp_path):
+def test_time_and_voltage_of_a_table(content, columns, step, volts, tmp_path):
     found = read_recording(written(tmp_path, content), columns=columns)
     np.testing.assert_allclose(found.voltage, volts)
-    np.testing.assert_allclose(np.diff(found.t), step)
+    np.testing.assert_allclose(np.diff(found.t), step, rtol=1e-5)
 
 
 @pytest.mark.parametrize('cells, given, volts, amps', [
@@ -655,19 +667,6 @@ def test_bytes_of_unknown_tables_do_not_stop_the_reading(tmp_path):
     path = written(tmp_path, f't,U,note\n{rows}'.encode('cp1252') + b'9000,12\x81,\n')
     with pytest.raises(InputError, match="9002: column 'U' holds '12"):
         read_recording(path)
-
-
-def test_utf_16_needs_no_mark_of_its_byte_order(tmp_path):
-    text = table(['Zeit;Spannung [V]'], lambda k: f'{german(k / 8)};{german(V[k])}')
-    found = read_recording(written(tmp_path, text.encode('utf-16-le')))
-    np.testing.assert_allclose(found.voltage, V)
-    assert 'utf-16-le' in found.notes[0]
-
-
-def test_a_date_and_a_clock_are_one_time(tmp_path):
-    path = written(tmp_path, 'Datum;Uhrzeit;U\n16.05.2024;23:59:59,5;12\n'
-                             '19.05.2024;00:00:00,5;13\n19.05.2024;00:00:02,0;14\n')
-    np.testing.assert_allclose(np.diff(read_recording(path).t), [172801.0, 1.5])
 
 
 @pytest.mark.parametrize('name, given, words', [
@@ -823,38 +822,31 @@ def test_a_level_is_no_voltage_if_it_may_be_something_else(header, tmp_path):
             map(str, (0.1 * k, U[k], V[k], V[k] + 1)[:header.count(',') + 1])))))
 
 
-def test_the_unit_of_a_throttle(tmp_path):
-    rows = 't,U,gas,I\n' + ''.join(f'{k},12,{g},3\n' for k, g in enumerate((1100, 1500, 1900)))
-    path = written(tmp_path, rows)
-    np.testing.assert_allclose(read_recording(path).throttle, [0.1, 0.5, 0.9])
+@pytest.mark.parametrize('name, cells, given, throttle', [
+    ('gas', (1100, 1500, 1900), CsvColumns(), [0.1, 0.5, 0.9]),
     # An output is without pulses until it is armed.
-    armed = written(tmp_path, rows.replace('gas', 'RCOut').replace('1100', '0'), 'e.csv')
-    np.testing.assert_allclose(read_recording(armed).throttle, [0.0, 0.5, 0.9])
+    ('RCOut', (0, 1500, 1900), CsvColumns(), [0.0, 0.5, 0.9]),
     # The thrust of a Crazyflie may have decimals.
-    thrust = written(tmp_path, rows.replace('1100', '0').replace('1500', '6553.5').replace(
-        '1900', '58981.5'), 'a.csv')
-    np.testing.assert_allclose(read_recording(thrust).throttle, [0.0, 0.1, 0.9])
-    percent = written(tmp_path, rows.replace('1100', '1').replace('1500', '2').replace(
-        '1900', '1.5'), 'b.csv')
-    found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
-    assert found.throttle[0] == pytest.approx(0.01) and found.current is None
-    assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
-    # Pulses in ms.
-    pulses = written(tmp_path, 't,U,Throttle\n0,12,1.1\n1,12,1.9\n', 'd.csv')
-    np.testing.assert_allclose(read_recording(pulses).throttle, [0.1, 0.9])
+    ('gas', (0, 6553.5, 58981.5), CsvColumns(), [0.0, 0.1, 0.9]),
+    ('gas', (1, 2, 1.5), CsvColumns(throttle_unit='%'), [0.01, 0.02, 0.015]),
+    # Pulses in ms; a stick at rest; a duty below 0 runs a motor in reverse.
+    ('Throttle', (1.1, 1.9), CsvColumns(), [0.1, 0.9]),
+    ('Thr', (-1024, -1024), CsvColumns(), [0.0, 0.0]),
+    ('duty [%]', (-50, 50), CsvColumns(), [-0.5, 0.5]),
     # The output of a lever, in V, is no percentage.
-    lever = written(tmp_path, rows.replace('1100', '0.9').replace('1500', '2.0').replace(
-        '1900', '4.1'), 'g.csv')
-    with pytest.raises(InputError, match='throttle runs from 0.9 to 4.1'):
-        read_recording(lever)
-    # A stick at rest.
-    stick = written(tmp_path, 't,U,Thr\n0,12,-1024\n1,12,-1024\n', 'f.csv')
-    np.testing.assert_allclose(read_recording(stick).throttle, [0.0, 0.0])
-    # A duty below 0 runs a motor in reverse.
-    duty = written(tmp_path, 't,U,duty [%]\n0,12,-50\n1,12,50\n', 'c.csv')
-    np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
-    with pytest.raises(InputError, match='not a pulse in us: half of its values are below'):
-        read_recording(percent, columns=CsvColumns(throttle_unit='us', current='none'))
+    ('gas', (0.9, 2.0, 4.1), CsvColumns(), 'throttle runs from 0.9 to 4.1'),
+    ('gas', (1, 2, 1.5), CsvColumns(throttle_unit='us'),
+     'not a pulse in us: half of its values are below')])
+def test_the_unit_of_a_throttle(name, cells, given, throttle, tmp_path):
+    path = written(tmp_path, f't,U,{name},I\n' + ''.join(
+        f'{k},12,{cell},3\n' for k, cell in enumerate(cells)))
+    if isinstance(throttle, str):
+        with pytest.raises(InputError, match=throttle):
+            read_recording(path, columns=given)
+        return
+    np.testing.assert_allclose(read_recording(path, columns=given).throttle, throttle)
+    without = read_recording(path, columns=CsvColumns(throttle='none', current='none'))
+    assert not without.has_throttle and without.current is None
 
 
 @pytest.mark.parametrize('delimiter, decimal', [(',', '.'), ('\t', '.'), (';', ',')])
@@ -923,14 +915,6 @@ def test_series_that_rows_name_are_columns(tmp_path, order):
         text = 'time,mode,value\n' + ''.join(
             f'{k},{names[k // 20]},{12.0 + 0.1 * (k % 7)}\n' for k in range(60))
         assert read_recording(written(tmp_path, text), columns=CsvColumns(voltage='value')).n == 60
-
-
-def test_a_given_decimal_comma_makes_points_separate_thousands(tmp_path):
-    """Excel in German: 24.674 mV; dates and clocks keep their points."""
-    text = 'Zeit;U [mV]\n27.11.2026 10:15:23.125;24.674\n27.11.2026 10:15:23.250;1.024.673,5\n'
-    recording = read_recording(written(tmp_path, text), columns=CsvColumns(decimal=','))
-    np.testing.assert_allclose(recording.voltage, [24.674, 1024.6735])
-    np.testing.assert_allclose(np.diff(recording.t), 0.125, atol=1e-6)
 
 
 def test_three_digits_behind_a_quoted_comma_may_be_thousands(tmp_path):
@@ -1172,9 +1156,3 @@ def test_chinese_column_names_are_read(names, tmp_path):
     assert 'gb18030' in found.notes[0] and '电压' in found.notes[0]
     other = written(tmp_path, f'Größe,Zeit (s),Spannung (V)\n{rows}'.encode('cp1252'))
     assert 'cp1252' in read_recording(other).notes[0]
-
-
-def test_a_point_elsewhere_shows_that_quoted_commas_separate_thousands(tmp_path):
-    path = written(tmp_path, 'time_s,U (mV)\n' + ''.join(
-        f'{k / 100},"12,{k:03}"\n' for k in range(60)))
-    np.testing.assert_allclose(read_recording(path).voltage, 12.0 + 1e-3 * np.arange(60))

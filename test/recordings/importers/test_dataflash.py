@@ -30,6 +30,12 @@ def test_binary_and_text_logs_are_read_exactly(tmp_path, form):
         motors.values, ((pulses[:, :2] - 1100) / 800).mean(axis=1), rtol=1e-12)
 
 
+def test_progress_is_told_while_a_log_is_read(tmp_path):
+    shares = []
+    load(tmp_path, copter(1100)[0].binary, progress=shares.append)
+    assert shares and shares == sorted(shares) and 0.0 < shares[-1] <= 1.0
+
+
 def test_the_rail_by_name(tmp_path):
     """The 5 V rail is there for who asks for it; the battery's current goes with it."""
     path, log = load(tmp_path, copter()[0].binary)

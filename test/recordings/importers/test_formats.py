@@ -131,14 +131,6 @@ def series(name='v', quantity=VOLTAGE, t=(0.0, 1.0, 2.0), values=(5.0, 5.1, 5.2)
     return Series(name, quantity, np.array(t), np.array(values), '1', 'words', rank, group)
 
 
-def test_the_smallest_rank_is_the_default():
-    log = Log('x', (series('a', rank=None), series('b', rank=1), series('c', rank=0)))
-    assert choose(PATH, log).voltage.name == 'c'
-    assert choose(PATH, log, voltage='a').voltage.name == 'a'
-    with pytest.raises(InputError, match='no battery voltage.*a '):
-        choose(PATH, Log('x', (series('a', rank=None),)))
-
-
 def test_an_unknown_name_is_refused_with_the_nearest():
     log = Log('x', (series('battery'), series('gas', THROTTLE)))
     with pytest.raises(InputError, match="did you mean 'battery'"):
