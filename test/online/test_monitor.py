@@ -18,8 +18,9 @@ from ou_monitor.records import Level, Status
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import SampleStream
 from project import ROOT
+from pushed import pushed
 import pytest
-from simulated_packs import Pack
+from simulated_packs import flown
 
 
 def filled(seed=3, sigma=0.632, u0=5.0, n=2001, **settings):
@@ -44,8 +45,7 @@ def test_good_input_is_ok():
 
 
 def test_slow_input_warns_and_has_a_rough_risk():
-    monitor = SupplyMonitor()
-    monitor.push(np.arange(3.0), [5.0, 5.1, 4.9])
+    monitor = pushed(SupplyMonitor(), np.arange(3.0), [5.0, 5.1, 4.9])
     report = monitor.report(0.0)
     assert report.level is Level.WARN and report.brownout is False
     assert 0.0 < report.risk < 0.1 and report.risk_basis == 'excursions'
@@ -124,8 +124,7 @@ def test_a_reset_keeps_the_flag_and_forgets_the_samples():
 
 def test_a_reset_forgets_what_the_floor_has_seen():
     """One bad sample before and one after are two lone ones."""
-    monitor = SupplyMonitor()
-    monitor.push(0.0, 4.2)
+    monitor = pushed(SupplyMonitor(), 0.0, 4.2)
     monitor.reset('the clock jumped')
     monitor.push([0.001, 0.002], [4.2, 5.0])
     assert monitor.report(0.0).brownout is None
@@ -283,33 +282,21 @@ def test_the_budget_keeps_under_the_warning_when_told_so():
     assert MonitorSettings(brownout_budget_limit=0.05).budget_limit == 0.05
 
 
-TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
+FLIGHT = flown(3, 25.0)
 
 
-@pytest.fixture(scope='module')
-def flight():
-    """Return stamps, voltage and throttle of 25 s at 50 Hz."""
-    rng = np.random.default_rng(3)
-    t = np.arange(0.0, 25.0, 0.02)
-    u = np.clip(0.35 + 0.25 * rng.standard_normal(51), 0.0, 1.0)[(2 * t).astype(int)]
-    return t, TRUE.path(t, u) + 0.05 * rng.standard_normal(t.size), u
-
-
-def test_the_report_tells_the_load_where_no_relaxation_is_visible(flight):
+def test_the_report_tells_the_load_where_no_relaxation_is_visible():
     """White noise and sag at 50 Hz: alpha is unknown, the load is that of the filter alone."""
-    monitor = SupplyMonitor()
-    monitor.push(*flight)
+    monitor = pushed(SupplyMonitor(), *FLIGHT)
     report = monitor.report(0.0)
-    alone = LoadFilter()
-    alone.push(*flight)
+    alone = pushed(LoadFilter(), *FLIGHT)
     assert not report.estimate.usable and report.load.known
     assert report.load == alone.load() == monitor.load_filter.load()
 
 
-def test_parameters_never_reset_the_load_and_errors_do(flight):
+def test_parameters_never_reset_the_load_and_errors_do():
     """A shorter window and another limit change nothing; a restart begins anew."""
-    monitor = SupplyMonitor()
-    monitor.push(*flight)
+    monitor = pushed(SupplyMonitor(), *FLIGHT)
     before = monitor.report(0.0).load
     monitor.configure(MonitorSettings(window=0.5, brownout_voltage=13.0))
     monitor.set_model(None)
@@ -318,11 +305,10 @@ def test_parameters_never_reset_the_load_and_errors_do(flight):
     assert monitor.report(0.0).load.status is LoadStatus.NO_DATA
 
 
-def test_a_reset_of_time_keeps_the_sag(flight):
+def test_a_reset_of_time_keeps_the_sag():
     """The same stamps again, another pack: known with the first seconds."""
-    t, v, u = flight
-    monitor = SupplyMonitor()
-    monitor.push(t, v, u)
+    t, v, u = FLIGHT
+    monitor = pushed(SupplyMonitor(), t, v, u)
     before = monitor.report(0.0).load
     monitor.reset('a loop of a bag')
     monitor.push(t[:200], v[:200] - 1.0, u[:200])
@@ -331,9 +317,8 @@ def test_a_reset_of_time_keeps_the_sag(flight):
     assert float(after.sag(0.5)) == pytest.approx(float(before.sag(0.5)), rel=0.2)
 
 
-def test_the_fields_have_the_numbers_of_the_load(flight):
-    monitor = SupplyMonitor()
-    monitor.push(*flight)
+def test_the_fields_have_the_numbers_of_the_load():
+    monitor = pushed(SupplyMonitor(), *FLIGHT)
     report = monitor.report(0.0)
     fields = report.fields
     assert fields['load_status'] == 'KNOWN' and fields['load_basis'] == 'THROTTLE'
@@ -342,10 +327,10 @@ def test_the_fields_have_the_numbers_of_the_load(flight):
     assert fields['load_resistance'] == 'nan' and fields['load_delay'] == '0.0'
 
 
-def test_fields_are_numbers_whatever_leg_they_stand_on(flight):
+def test_fields_are_numbers_whatever_leg_they_stand_on():
     """As text that any language reads: no 'np.float64(0.3)'; numbers round-trip."""
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=13.5, brownout_horizon=1.0))
-    monitor.push(*flight)
+    monitor.push(*FLIGHT)
     report = monitor.report(0.0)
     assert report.risk_basis == 'load' and 0.0 < report.budget <= 1.0
     assert float(report.fields['throttle_budget']) == report.budget

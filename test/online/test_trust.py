@@ -15,6 +15,7 @@ from ou_monitor.online.trust import (
     ConstantReading, Doubt, InputClock, SourceInterval, StampOrder, StampWatch)
 from ou_monitor.records import Flag, Level
 from project import needs_recordings, REAL, recorded
+from pushed import pushed
 import pytest
 
 
@@ -332,8 +333,7 @@ def test_a_fast_source_is_stale_after_300_missed_samples():
     assert report.level is Level.STALE and report.brownout is None
     assert '0.3 s' in report.summary and '1000 Hz' in report.summary
     for dt, limit in ((0.01, 1.0), (1e-4, 0.3), (0.002, 0.6)):
-        monitor = SupplyMonitor()
-        monitor.push(np.arange(3000) * dt, ou(3000))
+        monitor = pushed(SupplyMonitor(), np.arange(3000) * dt, ou(3000))
         assert monitor.report(0.0).patience == pytest.approx(limit)
 
 

@@ -12,6 +12,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Recording, Status
 from project import ROOT
+from pushed import pushed
 import pytest
 from scipy.signal import lfilter
 
@@ -113,8 +114,7 @@ def test_a_number_is_the_sliding_window_and_a_change_loses_nothing():
     monitor = SupplyMonitor(MonitorSettings(window=5.0))
     push(monitor, recording)
     report = monitor.report(0.0)
-    plain = SlidingEstimator(5.0)
-    plain.push(recording.t, recording.voltage, recording.throttle)
+    plain = pushed(SlidingEstimator(5.0), recording.t, recording.voltage, recording.throttle)
     assert report.estimate == plain.estimate()
     assert report.ou.window_s == report.estimate.duration
     monitor.configure(MonitorSettings())
@@ -124,8 +124,7 @@ def test_a_number_is_the_sliding_window_and_a_change_loses_nothing():
 def test_what_is_too_old_is_not_known():
     """A fit that ended longer ago than its window is long says nothing of now."""
     recording = flown(1, 0.03, 0.005)
-    plain = SlidingEstimator(2.0)
-    plain.push(recording.t, recording.voltage, recording.throttle)
+    plain = pushed(SlidingEstimator(2.0), recording.t, recording.voltage, recording.throttle)
     e = plain.estimate()
     relaxation = RelaxationFits(background=False)
     monitor = SupplyMonitor()

@@ -49,3 +49,15 @@ class Pack:
         if not self.full_current:
             response += self.inrush * np.maximum(lagged - lowpass(lagged, t, INRUSH_TIME), 0.0)
         return rest - self.size * CELL * self.cells * response
+
+
+QUAD = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
+
+
+def flown(seed, seconds=40.0, noise=0.05, pack=QUAD, rest=0.0):
+    """Return stamps at 50 Hz, voltage and throttle, which steps each half second after a rest."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 0.02)
+    u = np.clip(0.35 + 0.25 * rng.standard_normal(round(2 * seconds) + 1), 0.0, 1.0)[
+        (2 * t).astype(int)] * (t >= rest)
+    return t, pack.path(t, u) + noise * rng.standard_normal(t.size), u

@@ -6,6 +6,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Counters, Status
+from pushed import pushed
 import pytest
 from simulated_windows import DT, paths, stamps
 
@@ -46,8 +47,7 @@ def test_windows_that_are_none_are_refused(window):
 
 
 def test_nothing_and_one_sample():
-    estimator = SlidingEstimator(2.0)
-    estimator.push([], [])
+    estimator = pushed(SlidingEstimator(2.0), [], [])
     estimator.push(np.empty(0), np.empty(0), 0.5)
     e = estimator.estimate()
     assert e.status is Status.NO_DATA and e.counters == Counters()
@@ -60,8 +60,7 @@ def test_nothing_and_one_sample():
 
 def test_a_fit_needs_twenty_samples():
     for n in (19, 20):
-        estimator = SlidingEstimator(2.0)
-        estimator.push(T[:n], Y[:n])
+        estimator = pushed(SlidingEstimator(2.0), T[:n], Y[:n])
         assert (estimator.estimate().status is Status.TOO_FEW_SAMPLES) == (n < 20)
 
 
@@ -70,14 +69,12 @@ def test_non_finite_samples_are_dropped_and_counted():
     y[[3, 500]] = np.nan, np.inf
     t[[10, 700]] = -np.inf, np.nan
     good = np.isfinite(t) & np.isfinite(y)
-    one, two = SlidingEstimator(2.0), SlidingEstimator(2.0)
-    one.push(t, y)
-    two.push(t[good], y[good])
+    one = pushed(SlidingEstimator(2.0), t, y)
+    two = pushed(SlidingEstimator(2.0), t[good], y[good])
     a, b = one.estimate(), two.estimate()
     assert a.counters == Counters(pushed=N, used=N - 4, non_finite=4)
     assert a.alpha == pytest.approx(b.alpha, rel=1e-12) and a.n == N - 4
-    only = SlidingEstimator(2.0)
-    only.push([0.0, np.nan], [np.nan, 5.0])
+    only = pushed(SlidingEstimator(2.0), [0.0, np.nan], [np.nan, 5.0])
     e = only.estimate()
     assert e.status is Status.NO_DATA and e.counters == Counters(pushed=2, non_finite=2)
 
@@ -86,20 +83,17 @@ def test_late_samples_in_one_batch_are_sorted_in():
     order = np.random.default_rng(42).permutation(N)
     # The first stamp stays first: what comes before the window begins is another matter.
     order = np.concatenate([[0], order[order != 0]])
-    one, two = SlidingEstimator(2.0), SlidingEstimator(2.0)
-    one.push(T, Y)
-    two.push(T[order], Y[order])
+    one = pushed(SlidingEstimator(2.0), T, Y)
+    two = pushed(SlidingEstimator(2.0), T[order], Y[order])
     alike(one.estimate(), two.estimate(), rel=1e-12)
     assert two.estimate().counters == Counters(pushed=N, used=N)
-    three = SlidingEstimator(2.0)
-    three.push(np.append(T, T[-1]), np.append(Y, 99.0))
+    three = pushed(SlidingEstimator(2.0), np.append(T, T[-1]), np.append(Y, 99.0))
     e = three.estimate()
     assert e.counters == Counters(pushed=N + 1, used=N, late=1) and e.voltage == Y[-1]
 
 
 def test_late_samples_after_an_estimate_are_dropped_and_counted():
-    estimator = SlidingEstimator(2.0)
-    estimator.push(T, Y)
+    estimator = pushed(SlidingEstimator(2.0), T, Y)
     before = estimator.estimate()
     estimator.push(T[-5:], Y[-5:])
     after = estimator.estimate()
@@ -132,8 +126,7 @@ def test_jumps_of_more_than_the_window_clear_it(shift, first):
 
 
 def test_reset_clears_and_counts():
-    estimator = SlidingEstimator(2.0)
-    estimator.push(T, Y)
+    estimator = pushed(SlidingEstimator(2.0), T, Y)
     estimator.reset()
     e = estimator.estimate()
     assert e.status is Status.NO_DATA and e.n == 0

@@ -6,6 +6,7 @@ import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Status
+from pushed import pushed
 import pytest
 from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
 
@@ -119,8 +120,7 @@ def test_float32_and_lists():
     one = estimate(T, y)
     two = estimate(T, y.astype(np.float64))
     assert (one.alpha, one.sigma, one.u0, one.n) == (two.alpha, two.sigma, two.u0, two.n)
-    estimator = SlidingEstimator(2.1)
-    estimator.push(T.tolist(), y.tolist())
+    estimator = pushed(SlidingEstimator(2.1), T.tolist(), y.tolist())
     assert estimator.estimate().alpha == pytest.approx(two.alpha, rel=1e-9)
     assert one.alpha == pytest.approx(
         estimate(T, y + 1e-9).alpha, rel=1e-4)
@@ -142,8 +142,7 @@ def test_rate_that_changes_is_learnt_anew():
     for _ in range(30):
         t = np.concatenate([stamps(1000), 1.0 + stamps(600, 4e-3)])
         y = LEVEL + simulate(t, ALPHA, SIGMA, rng)
-        estimator = SlidingEstimator(2.0)
-        estimator.push(t[:1000], y[:1000])
+        estimator = pushed(SlidingEstimator(2.0), t[:1000], y[:1000])
         estimator.estimate()
         for begin in range(1000, 1600, 50):
             estimator.push(t[begin:begin + 50], y[begin:begin + 50])

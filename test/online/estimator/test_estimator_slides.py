@@ -9,6 +9,7 @@ from ou_monitor import SlidingEstimator
 from ou_monitor.online.estimator.estimator import BlockAverager
 from ou_monitor.records import Counters, Flag, Status
 from ou_monitor.timeline import as_columns, Batch
+from pushed import pushed
 import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, estimate, LEVEL, paths, SIGMA, stamps
@@ -77,8 +78,7 @@ def test_units_and_shifts(scale, shift, slower, moving):
 
 def test_window_change_keeps_samples():
     """Shorter: the newest stay. Longer: nothing is lost, and the past is not invented."""
-    estimator = SlidingEstimator(4.0)
-    estimator.push(T, Y)
+    estimator = pushed(SlidingEstimator(4.0), T, Y)
     assert estimator.estimate().n == pytest.approx(4000, abs=1)
     estimator.window = 1.0
     e = estimator.estimate()
@@ -116,8 +116,7 @@ def test_no_drift_and_bounded_memory():
     assert end - begin < 4e6 and peak < 3e7
     e = old.estimate()
     assert e.counters == Counters(pushed=10_000 * blocks, used=10_000 * blocks)
-    new = SlidingEstimator(2.0)
-    new.push((blocks - 1) * 10.0 + t, y)
+    new = pushed(SlidingEstimator(2.0), (blocks - 1) * 10.0 + t, y)
     # New searches start elsewhere, which is 1e-6.
     fresh = new.estimate()
     assert (e.n, e.status) == (fresh.n, fresh.status)
@@ -191,8 +190,7 @@ def test_repeats_of_a_fast_source_are_seen_before_it_is_thinned():
     """Each value twice at 20 kHz: nothing is cleared to drop them, half of all are held."""
     n = 10_000
     y = np.repeat(paths(np.random.default_rng(6), 1, n // 2, 1e-4)[0], 2)
-    estimator = SlidingEstimator(1.0)
-    estimator.push(stamps(n, 5e-5), y)
+    estimator = pushed(SlidingEstimator(1.0), stamps(n, 5e-5), y)
     e = estimator.estimate()
     assert e.counters.resets == 0 and Flag.HELD_SAMPLES in e.flags
     assert e.counters.held == pytest.approx(n / 2, abs=2) and e.n == pytest.approx(n / 2, abs=2)
@@ -205,8 +203,7 @@ def test_quality_is_that_of_the_newest_thousand(since, told):
     low = 2000 - since
     y[low:low + 400] = np.minimum(y[low:low + 400], LEVEL)
     y[low:low + 400] = np.where(y[low:low + 400] == LEVEL, y.max() + 0.01, y[low:low + 400])
-    estimator = SlidingEstimator(2.1)
-    estimator.push(stamps(2000), y)
+    estimator = pushed(SlidingEstimator(2.1), stamps(2000), y)
     assert (Flag.SATURATED in estimator.estimate().flags) is told
 
 
@@ -232,8 +229,7 @@ def test_trends_are_few_where_there_is_none_and_seen_where_there_is():
     def share(windows):
         told = 0
         for y in windows:
-            estimator = SlidingEstimator(1.0)
-            estimator.push(stamps(y.size), y)
+            estimator = pushed(SlidingEstimator(1.0), stamps(y.size), y)
             told += Flag.TREND in estimator.estimate().flags
         return told / len(windows)
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Flag, Status
+from pushed import pushed
 import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, estimate, LEVEL, paths, stamps
@@ -94,8 +95,7 @@ STATUS = {
 @pytest.mark.parametrize('status', STATUS, ids=lambda s: s.name)
 def test_each_status_has_numbers_only_where_they_may_be_used(status):
     t, y = STATUS[status]()
-    estimator = SlidingEstimator(2.1)
-    estimator.push(t, y)
+    estimator = pushed(SlidingEstimator(2.1), t, y)
     e = estimator.estimate()
     # A random walk looks like a few relaxations as often as like none.
     assert e.status is status or {e.status, status} == {Status.TOO_SHORT, Status.UNBOUND}

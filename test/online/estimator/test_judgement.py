@@ -14,6 +14,7 @@ from ou_monitor.records import (
     Counters, Estimate, Flag, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status)
 from ou_monitor.report.analysis_document import analysis_document
 from ou_monitor.report.terminal import terminal
+from pushed import pushed
 import pytest
 
 
@@ -191,8 +192,7 @@ def test_a_ratio_follows_the_same_rule():
 @pytest.mark.parametrize('seed', [3, 122])
 def test_the_estimator_publishes_nothing_of_it(seed):
     recording = nearly_white(seed)
-    estimator = SlidingEstimator(window=10.0)
-    estimator.push(recording.t, recording.voltage)
+    estimator = pushed(SlidingEstimator(window=10.0), recording.t, recording.voltage)
     e = estimator.estimate()
     assert e.status in (Status.BURIED, Status.NO_RELAXATION)
     assert all(math.isnan(getattr(e, name)) for name in NAMES)

@@ -6,6 +6,7 @@ import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.online.estimator.quality import examine, lattice, Quality
 from ou_monitor.records import Flag, Status
+from pushed import pushed
 import pytest
 from simulated_windows import DT, estimate, LEVEL, paths, stamps
 
@@ -106,15 +107,13 @@ def test_tiny_noise_on_a_large_voltage_is_measured():
 
 
 def test_what_is_dropped_is_said_though_the_numbers_stand():
-    estimator = SlidingEstimator(2.1)
-    estimator.push(T, paths(np.random.default_rng(5), 1, N)[0])
+    estimator = pushed(SlidingEstimator(2.1), T, paths(np.random.default_rng(5), 1, N)[0])
     before = estimator.estimate()
     estimator.push(1.0, 5.0)
     after = estimator.estimate()
     assert before.flags == () and after.flags == (Flag.IRREGULAR,)
     assert (after.counters.late, after.alpha) == (1, before.alpha)
     # Samples that wait for the rate are said to wait, with what was dropped.
-    waits = SlidingEstimator(2.0)
-    waits.push(T[:4], [5.0, math.nan, 5.1, 5.2])
+    waits = pushed(SlidingEstimator(2.0), T[:4], [5.0, math.nan, 5.1, 5.2])
     assert waits.estimate().status is Status.TOO_FEW_SAMPLES
     assert waits.estimate().flags == (Flag.IRREGULAR,)

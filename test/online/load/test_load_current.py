@@ -4,6 +4,7 @@ import numpy as np
 from ou_monitor.model.load import lowpass
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import Basis, LoadStatus
+from pushed import pushed
 import pytest
 from simulated_packs import Pack
 
@@ -26,9 +27,7 @@ def flight():
 
 
 def loaded(t, v, u, current):
-    loads = LoadFilter()
-    loads.push(t, v, u, current)
-    return loads.load()
+    return pushed(LoadFilter(), t, v, u, current).load()
 
 
 @pytest.mark.parametrize('scale', [1.0, -1.0, 1000.0, 0.01])
@@ -52,8 +51,7 @@ def test_the_voltage_at_rest_is_kept_when_the_current_rises():
         t = np.arange(0.0, 22.0, 0.02)
         drawn = np.where(t < 7.0, 1.4, rng.uniform(2.0, 6.0, 45)[(2 * t).astype(int)])
         v = 15.2 - 0.1 * lowpass(drawn, t, 0.1) + 0.05 * rng.standard_normal(t.size)
-        loads = LoadFilter()
-        loads.push(t, v, None, lowpass(drawn, t, 0.1))
+        loads = pushed(LoadFilter(), t, v, None, lowpass(drawn, t, 0.1))
         errors.append(loads._current.level - 15.2)
     assert np.sqrt(np.mean(np.square(errors))) < 0.085
 

@@ -4,33 +4,19 @@ import numpy as np
 from ou_monitor.online.load.blocks import DELAYS, LoadDelay
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadStatus
+from pushed import pushed
 import pytest
-from simulated_packs import Pack
+from simulated_packs import flown, Pack
 
-TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
-
-
-@pytest.fixture(scope='module')
-def flight():
-    """Return stamps, voltage and throttle of 40 s at 50 Hz."""
-    rng = np.random.default_rng(4)
-    t = np.arange(0.0, 40.0, 0.02)
-    u = np.clip(0.35 + 0.25 * rng.standard_normal(81), 0.0, 1.0)[(2 * t).astype(int)]
-    return t, TRUE.path(t, u) + 0.05 * rng.standard_normal(t.size), u
-
-
-def loaded(t, v, u):
-    loads = LoadFilter()
-    loads.push(t, v, u)
-    return loads
+FLIGHT = flown(4)
 
 
 @pytest.mark.parametrize('late', DELAYS)
-def test_late_throttle_is_found_and_costs_nothing(flight, late):
-    t, v, u = flight
+def test_late_throttle_is_found_and_costs_nothing(late):
+    t, v, u = FLIGHT
     n = round(late / 0.02)
     heard = np.concatenate((np.full(n, u[0]), u))[:t.size]
-    loads, prompt = loaded(t, v, heard), loaded(t, v, u)
+    loads, prompt = pushed(LoadFilter(), t, v, heard), pushed(LoadFilter(), t, v, u)
     load, expected = loads.load(), prompt.load()
     assert load.delay == late and expected.delay == 0.0
     assert load.known
@@ -56,9 +42,9 @@ def test_a_slow_source_cannot_tell():
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_a_voltage_that_moves_by_itself_is_no_answer(flight, seed):
+def test_a_voltage_that_moves_by_itself_is_no_answer(seed):
     """Throttle of another vehicle over another one's sags: no relation in any of 20 looks."""
-    t, v, _ = flight
+    t, v, _ = FLIGHT
     rng = np.random.default_rng(seed)
     u = np.clip(0.4 + 0.2 * rng.standard_normal(134), 0.0, 1.0)[(t / 0.3).astype(int)]
     loads = LoadFilter()
@@ -77,10 +63,10 @@ def test_steps_of_the_adc_that_hide_the_answer():
     u = np.clip(0.6 + 0.05 * rng.standard_normal(161), 0.0, 1.0)[(4 * t).astype(int)]
     cell = Pack(1, 0.4, charge=0.6, size=0.15, power=1.8, endurance=2000.0)
     v = cell.path(t, u) + 0.002 * rng.standard_normal(t.size)
-    coarse = loaded(t, np.round(v, 1), u).load()
+    coarse = pushed(LoadFilter(), t, np.round(v, 1), u).load()
     size = 0.15 * 3.8 * 0.6 ** 1.8
     assert not coarse.known or abs(coarse.sag(0.6) - size) < 3.0 * coarse.sag_se(0.6)
-    fine = loaded(t, np.round(v, 3), u).load()
+    fine = pushed(LoadFilter(), t, np.round(v, 3), u).load()
     assert fine.known
     swing = fine.sag(0.65) - fine.sag(0.55)
     assert swing == pytest.approx(0.15 * 3.8 * (0.65 ** 1.8 - 0.55 ** 1.8), rel=0.35)

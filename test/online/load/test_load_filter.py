@@ -10,10 +10,10 @@ from ou_monitor.online.load.supply_load import HOLD, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
 from ou_monitor.timeline import as_columns, TimeLine
+from pushed import pushed
 import pytest
-from simulated_packs import Pack
+from simulated_packs import flown, QUAD
 
-TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
 # Its sag after a second at full throttle, V.
 SAG = 0.15 * 15.2 * (1.0 + 0.2 * -np.expm1(-HOLD / 1.0) + 0.3 * -np.expm1(-HOLD / 20.0))
 
@@ -23,23 +23,13 @@ def throttle_of_a_flight(t, rng):
     return steps[(2 * t).astype(int)]
 
 
-def flight(seconds=40.0, noise=0.05, seed=3):
-    """Return stamps, voltage and throttle of a simulated pack at 50 Hz."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(0.0, seconds, 0.02)
-    u = throttle_of_a_flight(t, rng)
-    return t, TRUE.path(t, u) + noise * rng.standard_normal(t.size), u
-
-
 def loaded(t, v, u):
-    loads = LoadFilter()
-    loads.push(t, v, u)
-    return loads.load()
+    return pushed(LoadFilter(), t, v, u).load()
 
 
 def test_a_simulated_pack_is_recovered():
     """Sag, level and noise; scalar by scalar gives the same as arrays."""
-    t, v, u = flight()
+    t, v, u = flown(3)
     load = loaded(t, v, u)
     assert load.known and load.status is LoadStatus.KNOWN
     for throttle in (0.2, 0.4, 0.6):
@@ -72,7 +62,7 @@ def test_a_lag_of_any_length_is_in_the_sag(lag):
 
 def test_the_sag_rises_and_its_error_has_a_floor():
     """Monotone in throttle; never known better than to a tenth."""
-    load = loaded(*flight(noise=0.005))
+    load = loaded(*flown(3, noise=0.005))
     u = np.linspace(0.0, 1.0, 33)
     assert (np.diff(load.sag(u)) >= 0.0).all()
     assert (load.sag_se(u) >= 0.1 * load.sag(u) - 1e-12).all()
@@ -91,8 +81,7 @@ def test_an_extrapolated_sag_is_known_no_better_than_a_measured_one():
 
 def test_a_held_throttle_ends_at_a_steady_answer():
     """The path ahead forgets its start: a minute later only discharge is left."""
-    loads = LoadFilter()
-    loads.push(*flight())
+    loads = pushed(LoadFilter(), *flown(3))
     ahead = 40.0 + np.arange(1.0, 120.0)
     path = loads.path(ahead, np.full(ahead.size, 0.4))
     fall = np.diff(path)[80:]
@@ -105,19 +94,17 @@ def test_a_held_throttle_ends_at_a_steady_answer():
 @pytest.mark.parametrize('throttle, tolerance', [(0.0, 1e-9), (0.5, 5e-3)])
 def test_two_half_steps_are_one_in_a_gap(throttle, tolerance):
     """The lags are exact over a gap; discharge takes the slope at its start, 1 mV a second."""
-    t, v, u = flight()
+    t, v, u = flown(3)
     u[-25:] = throttle
-    loads = LoadFilter()
-    loads.push(t, v, u)
+    loads = pushed(LoadFilter(), t, v, u)
     once = loads.path(np.array([t[-1] + 7.0]), np.array([throttle]))
     twice = loads.path(t[-1] + np.array([3.5, 7.0]), np.array([throttle, throttle]))
     assert once[-1] == pytest.approx(twice[-1], abs=tolerance)
 
 
 def test_looking_changes_nothing():
-    t, v, u = flight()
-    loads = LoadFilter()
-    loads.push(t, v, u)
+    t, v, u = flown(3)
+    loads = pushed(LoadFilter(), t, v, u)
     before = loads.load()
     loads.path(t[-1] + np.arange(1.0, 9.0), np.linspace(0.0, 1.0, 8))
     assert loads.load() == before
@@ -126,7 +113,7 @@ def test_looking_changes_nothing():
 
 
 def test_a_throttle_that_never_moved_says_nothing_of_the_sag():
-    t, v, u = flight()
+    t, v, u = flown(3)
     load = loaded(t, 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size), 0.0 * u + 0.3)
     assert load.status is LoadStatus.STILL and not load.known
     assert np.isnan(load.sag(0.5)) and np.isnan(load.sag_se(0.5))
@@ -135,19 +122,19 @@ def test_a_throttle_that_never_moved_says_nothing_of_the_sag():
 
 @pytest.mark.parametrize('seed', range(4))
 def test_throttle_of_another_vehicle_is_no_relation(seed):
-    t, _, u = flight(60.0)
+    t, _, u = flown(3, 60.0)
     v = 16.0 + 0.05 * np.random.default_rng(seed + 10).standard_normal(t.size)
     assert not loaded(t, v, u).known
 
 
 def test_a_voltage_that_rises_with_throttle_has_no_sag():
-    t, v, u = flight(60.0)
+    t, v, u = flown(3, 60.0)
     load = loaded(t, v, 1.0 - u)
     assert load.status is LoadStatus.RISES and np.isnan([load.sag(1.0), load.sag_se(1.0)]).all()
 
 
 def test_throttle_that_is_not_repeated_holds():
-    t, v, u = flight()
+    t, v, u = flown(3)
     gap = u.copy()
     gap[1:][np.diff(u) == 0.0] = np.nan
     assert loaded(t, v, gap) == loaded(t, v, u)
@@ -156,9 +143,8 @@ def test_throttle_that_is_not_repeated_holds():
 @pytest.mark.parametrize('jump', [-1000.0, 1000.0])
 def test_a_clock_that_jumps_keeps_the_sag_and_opens_the_level(jump):
     """Another pack, 1 V lower: the sag is known at once, the level within seconds."""
-    t, v, u = flight()
-    loads = LoadFilter()
-    loads.push(t, v, u)
+    t, v, u = flown(3)
+    loads = pushed(LoadFilter(), t, v, u)
     before = loads.load()
     n = 300
     if jump < 0.0:
@@ -171,16 +157,15 @@ def test_a_clock_that_jumps_keeps_the_sag_and_opens_the_level(jump):
 
 def test_a_pack_of_another_size_begins_anew():
     """After a new time line 6 cells for 4 are another craft."""
-    t, v, u = flight()
-    loads = LoadFilter()
-    loads.push(t + 1000.0, v * 1.7, u)
+    t, v, u = flown(3)
+    loads = pushed(LoadFilter(), t + 1000.0, v * 1.7, u)
     loads.new_time_line()
     loads.push(t, v, u)
     assert loads.load() == loaded(t, v, u)
 
 
 def test_throttle_that_was_never_heard():
-    t, v, u = flight()
+    t, v, u = flown(3)
     v = 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size)
     for throttle in (None, np.full(t.size, np.nan), 100.0 * u + 3.0):
         load = loaded(t, v, throttle)
@@ -192,10 +177,9 @@ def test_throttle_that_was_never_heard():
 
 def test_throttle_lost_in_flight_and_found_again():
     """What it did is kept; when it is back the sag is known at once."""
-    t, v, u = flight(60.0)
+    t, v, u = flown(3, 60.0)
     gone = (t > 30.0) & (t < 45.0)
-    loads = LoadFilter()
-    loads.push(t[t <= 30.0], v[t <= 30.0], u[t <= 30.0])
+    loads = pushed(LoadFilter(), t[t <= 30.0], v[t <= 30.0], u[t <= 30.0])
     before = loads.load()
     loads.push(t[gone], v[gone])
     lost = loads.load()
@@ -213,7 +197,7 @@ def test_a_fast_source_is_averaged():
     rng = np.random.default_rng(3)
     t = np.arange(0.0, 25.0, 0.001)
     u = throttle_of_a_flight(t, rng)
-    v = TRUE.path(t, u) + 0.05 * rng.standard_normal(t.size)
+    v = QUAD.path(t, u) + 0.05 * rng.standard_normal(t.size)
     load = loaded(t, v, u)
     assert load.known and 0.05 < float(load.noise(0.35)) < 0.07
     assert float(load.sag(0.5)) == pytest.approx(SAG * 0.5 ** 1.8, rel=0.2)
@@ -229,10 +213,9 @@ def test_a_fast_source_is_averaged():
 
 def test_one_sample_a_second():
     """Each counts at once; as throttle between them is not seen, the sag comes out low."""
-    t, v, u = flight(300.0)
+    t, v, u = flown(3, 300.0)
     t, v, u = t[::50], v[::50], u[::50]
-    loads = LoadFilter()
-    loads.push(t[0], v[0], u[0])
+    loads = pushed(LoadFilter(), t[0], v[0], u[0])
     assert np.isfinite(loads.load().level)
     loads.push(t, v, u)
     load = loads.load()
@@ -241,7 +224,7 @@ def test_one_sample_a_second():
 
 def test_another_battery_in_flight():
     """A level that jumps is found again, and the sag stays."""
-    t, v, u = flight(80.0)
+    t, v, u = flown(3, 80.0)
     load = loaded(t, np.where(t > 40.0, v - 1.5, v), u)
     plain = loaded(t, v, u)
     assert plain.level - load.level == pytest.approx(1.5, abs=0.2)
@@ -321,8 +304,7 @@ def test_noise_counts_the_changes_of_throttle_as_flown():
     u = np.clip(0.4 + 0.15 * rng.standard_normal(301), 0.0, 1.0)[(5 * t).astype(int)]
     moved = np.diff(u, prepend=u[0]) != 0.0
     noise = np.where(moved, 0.2, 0.02) * rng.standard_normal(t.size)
-    loads = LoadFilter()
-    loads.push(t, 16.0 - 1.5 * u ** 1.8 + noise, u)
+    loads = pushed(LoadFilter(), t, 16.0 - 1.5 * u ** 1.8 + noise, u)
     load = loads.load()
     for throttle in (0.3, 0.4, 0.5):
         near = np.abs(u - throttle) < 0.05
@@ -340,8 +322,7 @@ def test_a_sag_known_only_between_throttles_keeps_its_rise():
     u = 0.62 + 0.17 * np.sin(0.7 * t) * np.sin(0.05 * t)
     sag = 0.05 + 0.9 * np.maximum(u - 0.45, 0.0)**1.8
     v = 3.9 - sag - 0.001 * t + 0.002 * np.random.default_rng(3).standard_normal(t.size)
-    load_filter = LoadFilter()
-    load_filter.push(t, v, u)
+    load_filter = pushed(LoadFilter(), t, v, u)
     load = load_filter.load()
     rises = np.diff(load.sag(np.linspace(0.0, 1.0, 21)))
     assert load.known and (rises > -1e-9).all()
@@ -409,8 +390,7 @@ def test_the_fit_of_recordings_has_the_regressors_of_the_filter():
     """One load model, computed sample by sample and for a whole recording."""
     rng, t = np.random.default_rng(4), np.arange(0.0, 110.0, 0.02)
     u = np.where(t < 30.0, np.repeat(rng.uniform(0.1, 0.9, t.size // 25), 25), 0.3)
-    loads = LoadFilter()
-    loads.push(t, TRUE.path(t, u) + 0.02 * rng.standard_normal(t.size), u)
+    loads = pushed(LoadFilter(), t, QUAD.path(t, u) + 0.02 * rng.standard_normal(t.size), u)
     state = loads.state()
     # The last 80 s were at 0.3, so that all lags are settled; then steps of throttle.
     ahead = t[-1] + np.arange(0.02, 1.5, 0.02)

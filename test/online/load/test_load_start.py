@@ -11,28 +11,23 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import HOLD, LoadStatus
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.recordings.model_file import as_yaml, ModelFile, parse_model, read_model
+from pushed import pushed
 import pytest
-from simulated_packs import Pack
+from simulated_packs import flown, QUAD
 import yaml
 
-TRUE = Pack(4, 0.25, charge=0.85, size=0.15, power=1.8)
 # Sag after a second at full throttle, relative to `size`, V.
 SAG = 15.2 * (1.0 + 0.2 * -np.expm1(-HOLD / 1.0) + 0.3 * -np.expm1(-HOLD / 20.0))
 
 
-def flight(seed, model=TRUE):
+def flight(seed, pack=QUAD):
     """Return stamps, voltage and throttle of 30 s, the first 2 s at rest."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(0.0, 30.0, 0.02)
-    u = np.clip(0.35 + 0.25 * rng.standard_normal(61), 0.0, 1.0)[(2 * t).astype(int)]
-    u[t < 2.0] = 0.0
-    return t, model.path(t, u) + 0.05 * rng.standard_normal(t.size), u
+    return flown(seed, 30.0, pack=pack, rest=2.0)
 
 
 @pytest.fixture(scope='module')
 def learned():
-    loads = LoadFilter()
-    loads.push(*flight(1))
+    loads = pushed(LoadFilter(), *flight(1))
     return loads.learned()
 
 
@@ -58,7 +53,7 @@ def test_the_sag_is_known_at_take_off(learned):
 
 def test_another_day_is_learned(learned):
     """A pack with half as much sag again: after 28 s within two errors."""
-    worn = replace(TRUE, size=0.22)
+    worn = replace(QUAD, size=0.22)
     loads = begun(learned)
     loads.push(*flight(3, worn))
     load = loads.load()

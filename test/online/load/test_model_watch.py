@@ -18,6 +18,7 @@ from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Level, Recording
 from ou_monitor.simulation import constant, Profile, recorded_throttle, simulated
+from pushed import pushed
 import pytest
 
 # Learned from the recorded flight whose throttle the simulated ones have.
@@ -80,8 +81,7 @@ def test_the_noise_ratio_is_1_whatever_rate_and_throttle(noise):
         u = throttle(t)
         return t, model.simulate(t, np.random.default_rng(seed), u), u
 
-    loads = LoadFilter()
-    loads.push(*flown(FLOWN, 120.0, 100.0, 99))
+    loads = pushed(LoadFilter(), *flown(FLOWN, 120.0, 100.0, 99))
     start = loads.learned()
 
     def compared(throttle, rate, seed, more=0.0):
@@ -192,8 +192,7 @@ def against(start, made):
 
 
 def taught(made):
-    loads = LoadFilter()
-    loads.push(made.t, made.voltage, made.throttle)
+    loads = pushed(LoadFilter(), made.t, made.voltage, made.throttle)
     return loads.learned()
 
 

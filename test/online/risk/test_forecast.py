@@ -15,6 +15,7 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Status
 from ou_monitor.timeline import Batch
 from project import ROOT
+from pushed import pushed
 import pytest
 from scipy.signal import lfilter
 
@@ -387,9 +388,8 @@ def test_dips_that_throttle_does_not_tell_are_counted():
     u = np.where(t % 10.0 < 3.0, 0.0, 1.0)
     v = 14.0 - 2.0 * u + 0.03 * np.random.default_rng(5).standard_normal(t.size)
     v[(t % 6.0 > 5.9) & (u > 0.0)] -= 4.0
-    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=9.0, brownout_horizon=2.0))
-    for k in range(0, t.size, 10):
-        monitor.push(t[k:k + 10], v[k:k + 10], u[k:k + 10])
+    settings = MonitorSettings(brownout_voltage=9.0, brownout_horizon=2.0)
+    monitor = pushed(SupplyMonitor(settings), t, v, u, size=10)
     assert 0.02 < monitor.risk_if(1.0, 2.0, 9.0, 2.0) < 0.5
 
 
@@ -398,9 +398,8 @@ def test_the_risk_does_not_fall_with_the_horizon():
     t = np.arange(4000) / 100.0
     u = (t % 1.6 >= 0.8).astype(float)
     v = 12.05 - 0.11 * u + (0.005 + 0.005 * u) * np.random.default_rng(3).standard_normal(t.size)
-    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=11.94, brownout_horizon=5.0))
-    for k in range(0, t.size, 20):
-        monitor.push(t[k:k + 20], v[k:k + 20], u[k:k + 20])
+    settings = MonitorSettings(brownout_voltage=11.94, brownout_horizon=5.0)
+    monitor = pushed(SupplyMonitor(settings), t, v, u, size=20)
     risks = [float(monitor.risk_if(1.0, h, 11.94, h)) for h in (1.0, 2.0, 5.0)]
     assert risks == sorted(risks) and risks[0] > 0.5
 
