@@ -29,9 +29,6 @@ THROTTLES = tuple(k / 10.0 for k in range(11))
 _PART, _IN_PART = 60.0, 200
 # Maximum shift of the current against the voltage, s.
 _LATE = 0.06
-# Minimum step of a level that switches, in standard deviations of the change between readings (or
-# in steps of the ADC), and the number of readings on either side that must show half of it.
-_JUMP, _LASTS = 12.0, 5
 # Maximum range of throttle that counts as steady, and the time over which the range is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
 # Maximum share of readings left out as outliers ("wild"); if more are far off, none is left out.
@@ -109,9 +106,7 @@ def remainder(recording: Recording) -> Remainder:
     """Subtract level and load from the voltage of a recording."""
     t, n = recording.t, recording.n
     left, size, steps, walks, above = np.full(n, NAN), np.ones(n), [], [], 0.0
-    absorbed, used, load = np.zeros(ABSORBED_AT.size), 0, recording.current
-    if load is None and not recording.has_throttle:
-        load = _switched(recording.voltage)
+    absorbed, used = np.zeros(ABSORBED_AT.size), 0
     edges: list[int] = [] if not n else np.searchsorted(t, np.linspace(
         t[0], t[-1], 1 + max(1, min(round(float(t[-1] - t[0]) / _PART), n // _IN_PART)))[1:-1]
                                                 ).tolist()
@@ -120,7 +115,7 @@ def remainder(recording: Recording) -> Remainder:
             continue
         cut = slice(begin, end)
         part = regress(t[cut], recording.voltage[cut], recording.throttle[cut],
-                       None if load is None else load[cut], _LATE)
+                       None if recording.current is None else recording.current[cut], _LATE)
         if part.free >= FEWEST:
             left[begin + part.places] = part.voltage * math.sqrt(part.places.size / part.free)
             size[begin + part.places] = part.size
@@ -132,20 +127,6 @@ def remainder(recording: Recording) -> Remainder:
     return Remainder(left, size, float(np.median(steps)) if steps else NAN,
                      float(np.median(walks)) if walks else NAN, above,
                      absorbed / max(used, 1))
-
-
-def _switched(v: FloatArray) -> FloatArray | None:
-    """Return the sum of the steps of a level that switches, relative to its range, if any."""
-    change = np.diff(v, prepend=v[:1])
-    # The median of a normal absolute value is 0.6745 standard deviations.
-    least = _JUMP * max(float(np.median(np.abs(change))) / 0.6745, find_step(v)) if v.size else 0.0
-    steps = np.zeros(v.size)
-    for k in np.flatnonzero(np.abs(change) > least).tolist():
-        before, after = v[max(0, k - _LASTS):k], v[k:k + _LASTS]
-        if 2.0 * abs(float(np.median(after) - np.median(before))) > abs(change[k]):
-            steps[k] = change[k]
-    level = np.cumsum(steps)
-    return level / np.ptp(level) if steps.any() else None
 
 
 def without_wild(recording: Recording, left: Remainder) -> tuple[Recording, Remainder]:

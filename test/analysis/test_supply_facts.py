@@ -12,7 +12,6 @@ from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.noise import noise_of
 from ou_monitor.analysis.overview import answers, determined, known_lines, overview
 from ou_monitor.analysis.supply import alarms, node_for
-from ou_monitor.model.load import lowpass
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
@@ -277,20 +276,6 @@ def test_a_gap_after_a_low_sample_is_not_time_below():
     v[49] = 4.0
     dips = supply_facts(Recording(t, v, np.full(100, math.nan)), 4.5).dips
     assert (dips.count, dips.seconds) == (1, pytest.approx(0.1))
-
-
-@pytest.mark.parametrize('held, seconds', [(500, 0.0), (50, 0.0), (500, 0.06)])
-def test_noise_without_throttle_leaves_out_steps(held, seconds):
-    """A supply that switches by 0.5 V, at once or with settling, has 3 mV of noise."""
-    rng = np.random.default_rng(1)
-    level = np.repeat(0.5 * (rng.uniform(size=12_000 // held) > 0.5), held)
-    t = 0.02 * np.arange(level.size)
-    if seconds:
-        level = lowpass(level, t, seconds)
-    noise = supply_facts(Recording(
-        t, 12.0 + level + 0.003 * rng.standard_normal(t.size), None)).noise
-    assert noise.rms_v == noise.steady_rms_v
-    assert 0.0028 < noise.rms_v[0] < 0.005
 
 
 @pytest.mark.parametrize('step', [0.02, 0.2])
