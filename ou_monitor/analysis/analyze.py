@@ -93,7 +93,6 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                      [item for name, at in (
                          ('LINES_LEFT_IN', [one for one in judged if one.lines_kept]),
                          ('SECOND_RELAXATION', [one for one in judged if one.wanders]),
-                         ('AC_COUPLING', [one for one in judged if one.coupled]),
                          ('IMPULSES', [one for one in judged if one.estimate.usable
                                        and one.verdict.within is ProcessType.IMPULSES]))
                          for item in noise_items(name, [one.throttle for one in at])],

@@ -357,11 +357,6 @@ class LevelResult:
         return self.shape['second_relaxation'].rejects
 
     @property
-    def coupled(self) -> bool:
-        """Whether slow noise is missing, as behind an AC-coupled instrument."""
-        return self.shape.coupling_p < FAMILY_WISE
-
-    @property
     def crest(self) -> float:
         """Vpp over Vrms, dimensionless."""
         return self.vpp / self.vrms if self.vrms > 0.0 else NAN

@@ -42,7 +42,7 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.innovations import (
-    FAMILY_WISE, innovations, join, LEAST_SHARE, other_pole, OtherPole)
+    FAMILY_WISE, innovations, join, LEAST_SHARE, second_relaxation)
 from ou_monitor.records import (
     determined, Estimate, exp_or_inf, Flag, FloatArray, log_interval, NAN, Status)
 from ou_monitor.text import p_words
@@ -103,8 +103,6 @@ class Shape:
     kurtosis: float
     impulses: int  # Innovations beyond the 99 % quantile of the largest of n normal ones
     impulse_rate: tuple[float, float, float]  # Their rate, 1/s, and its 95 % interval (Poisson)
-    # p-value of the test for AC coupling, Holm-adjusted over all levels; NaN if not tested.
-    coupling_p: float = NAN
 
     def __getitem__(self, name: str) -> TestResult:
         return next(test for test in self.tests if test.name == name)
@@ -151,28 +149,24 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
                        max(abs(skewness), 0.5 * abs(kurtosis))),
             _impulses(local, kurtosis, count)]
     tests.append(correlated)
-    pole = OtherPole()
     if model:
-        pole = other_pole(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise, above)
+        second, share = second_relaxation(
+            apart, (n - len(parts)) / time, alpha, var_inf, noise * noise, above)
         tests += [_portmanteau('one_relaxation', [z], _LAGS_FITTED),
-                  TestResult('second_relaxation', pole.second_p, pole.second_share,
-                             why_not='' if math.isfinite(pole.second_p) else 'too few samples')]
+                  TestResult('second_relaxation', second, share,
+                             why_not='' if math.isfinite(second) else 'too few samples')]
     else:
         tests += [TestResult(name, why_not='there is no fitted model')
                   for name in ('one_relaxation', 'second_relaxation')]
-    return Shape(tuple(tests), n, skewness, kurtosis, count, _poisson(count, time),
-                 pole.coupling_p)
+    return Shape(tuple(tests), n, skewness, kurtosis, count, _poisson(count, time))
 
 
 def holm(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
     """Adjust the p-values of all levels together (Holm 1979)."""
     flat = [test.p_value for shape in shapes for test in shape.tests]
     found = iter(adjusted(flat))
-    # AC coupling is a family of its own, because it describes the instrument, not the process.
-    coupling = adjusted([shape.coupling_p for shape in shapes])
-    return tuple(replace(shape, coupling_p=p, tests=tuple(
-        replace(test, p_adjusted=next(found)) for test in shape.tests))
-        for shape, p in zip(shapes, coupling))
+    return tuple(replace(shape, tests=tuple(
+        replace(test, p_adjusted=next(found)) for test in shape.tests)) for shape in shapes)
 
 
 def adjusted(p_values: Sequence[float]) -> tuple[float, ...]:

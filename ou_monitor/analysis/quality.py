@@ -181,10 +181,6 @@ _NOISE = {
         'The noise shows a second relaxation, slower or faster than the fitted one: alpha, tau '
         'and Var_inf describe a mixture, and their intervals are valid for neither; other levels '
         'may have it too. `ou-monitor discover` fits both.'),
-    'AC_COUPLING': (
-        'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf '
-        'describe rail and instrument together; repeat with a DC-coupled instrument. '
-        '`ou-monitor discover` fits both.'),
     'IMPULSES': (
         'The noise has impulses: alpha, sigma and Var_inf include them, and their intervals are '
         'too narrow. `ou-monitor discover` tells impulses from noise.')}

@@ -1,12 +1,11 @@
-"""A second relaxation or an AC coupling: found in the innovations if it is there, only then."""
+"""A second relaxation: found in the innovations if it is there, only then."""
 
 import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_result import ProcessType
-from ou_monitor.analysis.quality import noise_items
-from ou_monitor.criticism.innovations import FAMILY_WISE, other_pole
+from ou_monitor.criticism.innovations import second_relaxation
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Recording
 import pytest
@@ -36,19 +35,9 @@ def recording(seed, seconds=10.0, second=None):
 
 def test_one_relaxation_is_left_alone():
     """200 parts of white innovations: at most 7 below 1 % (binomial: 4e-3 beyond)."""
-    found = [other_pole([np.random.default_rng(seed).standard_normal(3000)], RATE, ALPHA, 4e-4,
-                        9e-6) for seed in range(200)]
-    assert sum(pole.second_p < 0.01 for pole in found) <= 7
-    assert sum(pole.coupling_p < 0.01 for pole in found) <= 7
-
-
-@pytest.mark.parametrize('sizes', [[355], [600] * 10])
-def test_few_slow_ordinates_are_no_high_pass(sizes):
-    """400 levels of short parts of white innovations: at most 11 below 1 % (chance 1e-3)."""
-    rng = np.random.default_rng(1)
-    found = [other_pole([rng.standard_normal(n) for n in sizes], 50.0, 10.0, 2e-4, 1.6e-5)
-             for _ in range(400)]
-    assert sum(pole.coupling_p < 0.01 for pole in found) <= 11
+    found = [second_relaxation([np.random.default_rng(seed).standard_normal(3000)], RATE, ALPHA,
+                               4e-4, 9e-6)[0] for seed in range(200)]
+    assert sum(p < 0.01 for p in found) <= 7
 
 
 def detected(level):
@@ -77,46 +66,12 @@ def test_a_second_one_is_found_beside_the_wandering_level_and_said():
 
 
 def test_a_single_relaxation_is_called_a_diffusion():
-    """Ten recordings, with a chance of 1 % each for either finding: at most one."""
-    levels = [as_one_level(recording(seed)) for seed in range(10)]
-    assert sum(level.wanders for level in levels) <= 1
-    assert sum(level.coupled for level in levels) <= 1
+    """Ten recordings, with a chance of 1 % each: at most one."""
+    assert sum(as_one_level(recording(seed)).wanders for seed in range(10)) <= 1
 
 
 def test_too_few_samples_are_not_tested():
-    pole = other_pole([np.ones(40)], RATE, ALPHA, 4e-4, 0.0)
-    assert np.isnan([pole.second_p, pole.second_share, pole.coupling_p]).all()
-
-
-def test_without_an_ac_coupling_there_is_no_note():
-    assert noise_items('AC_COUPLING', []) == [] and FAMILY_WISE == 0.01
-
-
-@pytest.mark.parametrize('corner', [6.0, 15.0])
-def test_an_ac_coupled_instrument_is_found_and_said(corner):
-    """High-passes of 6 and 15 1/s before the noise of the sensor: 8 of 10 at least."""
-    keep, found = np.exp(-corner / RATE), []
-    for seed in range(10):
-        rail = recording(seed, seconds=20.0)
-        slow = lfilter([1.0 - keep], [1.0, -keep], rail.voltage - 5.0)
-        coupled = Recording(rail.t, rail.voltage - slow, rail.throttle, 'coupled')
-        found.append(as_one_level(coupled).coupled)
-    assert sum(found) >= 8
-    analysis = analyze(coupled)
-    named = [item for item in analysis.quality if item.name == 'AC_COUPLING']
-    assert bool(named) == analysis.levels[0].coupled == found[-1]
-
-
-@pytest.mark.parametrize('slow, coupled', [(0.2, True), (5.0, False)])
-def test_power_that_is_missing_is_a_high_pass_where_it_is_slow(slow, coupled):
-    """Innovations without a band below, or above, the rate of the OU."""
-    rng = np.random.default_rng(3)
-    n = 20000
-    spectrum = np.fft.rfft(rng.standard_normal(n))
-    omega = 2.0 * np.pi * np.fft.rfftfreq(n, 1.0 / RATE) / ALPHA
-    spectrum *= np.where(np.abs(np.log(np.maximum(omega, 1e-9) / slow)) < 0.7, 0.3, 1.0)
-    pole = other_pole([np.fft.irfft(spectrum, n)], RATE, ALPHA, 4e-4, 0.0)
-    assert (pole.coupling_p < FAMILY_WISE) is coupled
+    assert np.isnan(second_relaxation([np.ones(40)], RATE, ALPHA, 4e-4, 0.0)).all()
 
 
 def test_impulses_are_said_beside_the_fit_that_includes_them():
