@@ -2,7 +2,7 @@
 
 import shutil
 
-from made_bags import decode
+from made_bags import decode, START
 from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
@@ -17,8 +17,6 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
 import yaml
-
-START = 1_704_067_200_000_000_000
 
 
 def rows(reader, topics=None):

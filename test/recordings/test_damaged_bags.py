@@ -3,14 +3,13 @@
 import os
 import re
 import resource
-import shutil
 import struct
 import time
 
 import lz4.frame
 from made_bags import (
-    by_hand, channel, chunk, COUNT, HEAD, message, messages, MS, Op, record, records, schema,
-    START, supply, text, WAYS, write)
+    by_hand, channel, chunk, COUNT, folder_of, HEAD, message, messages, MS, Op, record, records,
+    schema, START, supply, text, WAYS, write)
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
@@ -274,14 +273,10 @@ def test_a_damaged_summary(tmp_path, shift):
 
 
 def test_one_of_several_files(tmp_path):
-    folder = tmp_path / 'bag'
-    folder.mkdir()
+    folder = folder_of(tmp_path / 'bag', 'bag_0.mcap', 'bag_1.mcap')
     write(folder / 'bag_0.mcap', ROWS)
     data = (folder / 'bag_0.mcap').read_bytes()
     (folder / 'bag_1.mcap').write_bytes(data[:len(data) // 2])
-    (folder / 'metadata.yaml').write_text(
-        'rosbag2_bagfile_information:\n  storage_identifier: mcap\n'
-        '  relative_file_paths: [bag_0.mcap, bag_1.mcap]\n')
     line = complaint(BagReader, folder)
     assert 'bag_1.mcap is damaged at byte' in line and 'into the recording' in line
     reader = BagReader(folder, partial=True)
@@ -388,14 +383,11 @@ def test_file_without_permission_is_refused(tmp_path, monkeypatch):
 
 
 def test_two_definitions_of_one_type(tmp_path):
-    folder = shutil.copytree(tmp_path, tmp_path / 'bag')
+    folder = folder_of(tmp_path / 'bag', 'bag_0.mcap', 'bag_1.mcap')
     for k, fields in enumerate(('float64 data\n', 'float32 other\nfloat32 data\n')):
         with BagWriter(folder / f'bag_{k}.mcap') as bag:
             bag.add_topic('voltage', FLOAT64, schema=fields)
             bag.write('voltage', k + 1, encode_scalars(FLOAT64, [5.0])[0])
-    (folder / 'metadata.yaml').write_text(
-        'rosbag2_bagfile_information:\n  storage_identifier: mcap\n'
-        '  relative_file_paths: [bag_0.mcap, bag_1.mcap]\n')
     assert 'two definitions' in complaint(read, folder)
 
 

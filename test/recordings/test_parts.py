@@ -1,6 +1,6 @@
 """Bags with all options of writing, read whole and in part: always the same samples."""
 
-from made_bags import write
+from made_bags import folder_of, MS, START, write
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from ou_monitor.errors import InputError
@@ -10,8 +10,6 @@ from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, SCHEMAS)
 import pytest
 
-START = 1_704_067_200_000_000_000
-MS = 1_000_000
 COUNT = 3000
 
 
@@ -102,15 +100,10 @@ def test_every_way_of_writing(bag, rows, tmp_path, compression, options):
 
 def test_overlapping_files_of_a_bag_are_one_recording(bag, rows, tmp_path):
     """A rosbag2 directory with files that overlap in time."""
-    folder = tmp_path / 'bag'
-    folder.mkdir()
-    parts = [rows[:1000], rows[1000:2500], rows[2500:]]
-    names = [write(folder / f'bag_{k}.mcap', part).name for k, part in enumerate(parts)]
-    (folder / 'metadata.yaml').write_text(
-        'rosbag2_bagfile_information:\n  storage_identifier: mcap\n  relative_file_paths: '
-        f'{names}\n')
-    whole = read_recording(bag)
-    same(read_recording(folder), whole)
+    folder = folder_of(tmp_path / 'bag', 'bag_0.mcap', 'bag_1.mcap', 'bag_2.mcap')
+    for k, part in enumerate((rows[:1000], rows[1000:2500], rows[2500:])):
+        write(folder / f'bag_{k}.mcap', part)
+    same(read_recording(folder), read_recording(bag))
 
 
 @pytest.mark.parametrize('stamped', [True, False])

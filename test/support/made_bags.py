@@ -41,6 +41,15 @@ def write(path, rows, **options):
     return path
 
 
+def folder_of(path, *names):
+    """Make a rosbag2 directory with the metadata of some files; return it."""
+    path.mkdir(exist_ok=True)
+    (path / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information:\n  storage_identifier: mcap\n'
+        f'  relative_file_paths: {list(names)}\n')
+    return path
+
+
 @cache
 def _way(generate, kind, text):
     return generate(kind, text or SCHEMAS[kind])[kind]

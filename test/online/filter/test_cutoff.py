@@ -143,10 +143,6 @@ def line(made, wanted, error=NAN, interval=0.0):
     return [made.update(one, error, DT, interval) for one in wanted]
 
 
-def test_starts_at_the_first_wanted_and_follows():
-    assert line(control(), [100.0, 50.0, 50.0]) == [100.0, 50.0, 50.0]
-
-
 def test_limits_saturate_and_say_which():
     made = control()
     assert line(made, [1.0]) == [20.0] and made.bound is Bound.LOWEST

@@ -24,8 +24,9 @@ def made(**changes):
 
 
 def line(flag, risks, step=1.0, start=0.0):
-    """Return the states for risks one step apart; None stands for data that do not arrive."""
-    return [flag.update(start + k * step, NAN if risk is None else risk, fresh=risk is not None)
+    """Return the states for risks one step apart, or at times; None: data do not arrive."""
+    return [flag.update(*risk) if isinstance(risk, tuple) else flag.update(
+        start + k * step, NAN if risk is None else risk, fresh=risk is not None)
             for k, risk in enumerate(risks)]
 
 
@@ -33,13 +34,8 @@ def check(states, letters):
     assert [s.level for s in states] == [LETTER[c] for c in letters.replace(' ', '')]
 
 
-def test_levels_are_entered_at_their_probability():
-    states = line(made(), [0.0, 0.00999, 0.01, 0.0999, 0.1, 1.0])
-    check(states, 'o o w w c c')
-    assert [s.brownout for s in states] == [False] * 4 + [True] * 2
-
-
 @pytest.mark.parametrize('changes, risks, letters', [
+    ({}, [0.0, 0.00999, 0.01, 0.0999, 0.1, 1.0], 'o o w w c c'),
     # Entered at 0.1 and 0.01, left below 0.05 and 0.005, one level at a time or two.
     ({}, [0.1, 0.06, 0.05, 0.049, 0.01, 0.005, 0.0049], 'c c c w w w o'),
     ({}, [0.2, 0.006, 0.2, 0.004], 'c w c o'),
@@ -55,8 +51,17 @@ def test_levels_are_entered_at_their_probability():
     # A risk that swings about critical has been above warn all the time.
     ({'delay': 2.0}, [0.0, 0.5, 0.05, 0.5, 0.5, 0.5], 'o o o w w c'),
     ({'latch': True}, [0.02, 0.0], 'w o'),
-    # A single gap does not flicker.
-    ({'hold': 2.0}, [0.5] * 9 + [NAN] + [0.5], 'c' * 11)])
+    # A single gap does not flicker; a longer one ends with the hold.
+    ({'hold': 2.0}, [0.5] * 9 + [NAN] + [0.5], 'c' * 11),
+    ({'hold': 3.0}, [0.5] * 6 + [NAN] * 4, 'cccccc cc uu'),
+    # Time back is no time.
+    ({'hold': 3.0, 'delay': 1.0}, [(1000.0, 0.5), (1001.0, 0.5), (10.0, NAN), (12.9, NAN),
+                                   (13.1, NAN)], 'u c c c u'),
+    ({'delay': 2.0}, [(1000.0, 0.0), (1001.0, 0.5), (1002.0, 0.5), (0.0, 0.5), (0.9, 0.5),
+                      (1.1, 0.5)], 'o o o o o c'),
+    # Without a time no hold can be counted: unknown; and the next known time counts again.
+    *(({'hold': 3.0}, [(0.0, 0.5), (when, NAN), (1.0, 0.5), (3.9, 0.0), (4.1, 0.0)], 'c u c c o')
+      for when in (NAN, math.inf, -math.inf))])
 def test_levels_follow_the_risk_over_time(changes, risks, letters):
     check(line(made(**{f'brownout_{name}': value for name, value in changes.items()}), risks),
           letters)
@@ -96,14 +101,6 @@ def test_latch_switched_off_ends_it_and_on_begins_it():
     check(line(flag, [0.0], start=5.0), 'c')
 
 
-def test_unknown_after_the_grace():
-    flag = made(brownout_hold=3.0)
-    states = line(flag, [0.5] * 6 + [NAN] * 4)
-    check(states, 'cccccc cc uu')
-    assert [s.brownout for s in states] == [True] * 8 + [None] * 2
-    assert 'not known' in states[6].reason
-
-
 def test_a_held_warning_never_says_false():
     states = line(made(brownout_hold=3.0), [0.02, NAN, NAN, NAN, 0.0])
     check(states, 'w w w u o')
@@ -131,27 +128,6 @@ def test_time_back_is_no_time(back):
     assert state.level is CRITICAL and state.age == pytest.approx(1.0)
     assert flag.update(start + 1.9, 0.0).level is CRITICAL
     assert flag.update(start + 2.1, 0.0).level is OK
-
-
-def test_time_back_and_not_knowing():
-    flag = made(brownout_hold=3.0, brownout_delay=1.0)
-    line(flag, [0.5, 0.5], start=1000.0)
-    check([flag.update(10.0, NAN), flag.update(12.9, NAN), flag.update(13.1, NAN)], 'c c u')
-
-
-def test_delay_and_time_back():
-    flag = made(brownout_delay=2.0)
-    line(flag, [0.0, 0.5, 0.5], start=1000.0)
-    check([flag.update(0.0, 0.5), flag.update(0.9, 0.5), flag.update(1.1, 0.5)], 'o o c')
-
-
-@pytest.mark.parametrize('when', [NAN, math.inf, -math.inf])
-def test_without_a_time_nothing_is_held(when):
-    """No hold can be counted then: unknown; and the next known time counts again."""
-    flag = made(brownout_hold=3.0)
-    line(flag, [0.5])
-    check([flag.update(when, NAN), flag.update(1.0, 0.5), flag.update(3.9, 0.0),
-           flag.update(4.1, 0.0)], 'u c c o')
 
 
 @pytest.mark.parametrize('risk', [-1e-9, 1.0 + 1e-9, math.inf, -math.inf])
