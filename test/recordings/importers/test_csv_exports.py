@@ -58,8 +58,6 @@ FORMS = {
     # MSO5000 without and with times.
     'rigol_mso': (table(['CH1V,t0 = -5.0e-04, tInc = 1.0e-05,'], lambda k: f'{V[k]:.4f},'), 1e-5,
                   False, False),
-    'rigol_dho': (table(['Time(s),CH1(V)'], lambda k: f'{1e-5 * k:.6e},{V[k]:.4e}'), 1e-5, False,
-                  False),
     # TDS1000: facts beside the first rows, no header.
     'tektronix_tds': ('\r\n'.join(
         f'{facts},{1e-5 * (k - 30):.11f},{V[k]:.5f},' for k, facts in enumerate(
@@ -97,11 +95,6 @@ FORMS = {
     'waveforms': (table(['#Digilent WaveForms Oscilloscope Acquisition', '#Sample rate: 100000Hz',
                          'Time (s),Channel 1 (V)'], lambda k: f'{1e-5 * k:.7f},{V[k]:.4f}'), 1e-5,
                   False, False),
-    'saleae': (table(['Time [s],Channel 0'], lambda k: f'{1e-5 * k:.9f},{V[k]:.6f}'), 1e-5, False,
-               False),
-    'joulescope': (table(['#time,current,voltage,power,charge,energy'],
-                         lambda k: f'{0.01 * k:.2f},{AMPS[k]},{V[k]},{AMPS[k] * V[k]:.4f},0,0'),
-                   0.01, False, True),
     # Names and units in comments; names in several lines, of which some are blank or repeated.
     'commented_units': (table(['# Export of a meter', '#time,current,voltage,power', '#s,A,V,W'],
                               lambda k: f'{0.01 * k:.2f},{AMPS[k]},{V[k]},0'), 0.01, False, True),
@@ -110,8 +103,6 @@ FORMS = {
     'names_repeated': (table(['timestamp,Voltage,Current', 'Berlin (+02:00),Pack [279],Pack [279]',
                               ',V,A'], lambda k: f'{clock(k)},{V[k]},{AMPS[k]}'), 0.01, False,
                        True),
-    'otii': (table(['Timestamp(s),Main current (A),Main voltage (V)'],
-                   lambda k: f'{0.01 * k:.3f},{AMPS[k]},{V[k]}'), 0.01, False, True),
     # Each topic at stamps of its own.
     'plotjuggler': (table(
         ['__time,/battery_state/voltage,/battery_state/current,/throttle/data,/imu/x'],
@@ -147,9 +138,6 @@ FORMS = {
         ['date,time,speed,voltage,phase_current,current,power,torque,pwm,battery_level,mode'],
         lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},20.1,{V[k]},9.1,{AMPS[k]},"
                   f'700,0,{100 * U[k]:.1f},80,Drive'), 0.01, True, True),
-    'edgetx': (table(['Date,Time,1RSS(dB),RxBt(V),Curr(A),Capa(mAh),Ptch(rad),Thr,SA'],
-                     lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},-60,{V[k]},"
-                               f'{AMPS[k]},0,0.1,{U[k]},1'), 0.01, True, True),
     'ulog2csv': (table(
         ['timestamp,voltage_v,voltage_filtered_v,current_a,current_filtered_a,voltage_cell_v[0]'],
         lambda k: f'{112500000 + 10000 * k},{V[k]},{V[k]},{AMPS[k]},3,3.9'), 0.01, False, True),
@@ -158,14 +146,6 @@ FORMS = {
                  0.01, False, True),
     'arduino': (table(['millis;Ubat_mV'], lambda k: f'{4000 + 10 * k};{1e3 * V[k]:.0f}'), 0.01,
                 False, False),
-    'ltspice': (table(['time\tV(vbus)'], lambda k: f'{1e-5 * k:.6e}\t{V[k]:.4e}'), 1e-5, False,
-                False),
-    'iso': (table(['Timestamp,Battery Voltage'],
-                  lambda k: f"{clock(k, '%Y-%m-%dT%H:%M:%S.')}{10 * k % 1000:03d}Z,{V[k]}"), 0.01,
-            False, False),
-    'us_clock': (table(['Time,Volts'], lambda k: f"{clock(k, '%m/%d/%Y %I:%M:%S.')}"
-                                                 f'{10 * k % 1000:03d} AM,{V[k]}'), 0.01, False,
-                 False),
     # Names in a comment, between blanks whatever the delimiter; `u` is the throttle.
     'gnuplot': (table(['# time voltage current'],
                       lambda k: f'{0.01 * k:.2f}\t{V[k]}\t{AMPS[k]}'), 0.01, False, True),
@@ -177,9 +157,6 @@ FORMS = {
     'infiniium': (table(['Type:,raw', 'Points:,60', 'XInc:,1.0E-05', 'XOrg:,-2.0E-03',
                          'Y Units:,Volt', 'Data:,'], lambda k: f'{1e-5 * k:.11E},{V[k]:.6E}',
                         '\r\n'), 1e-5, False, False),
-    'excel_fr': ('\ufeff' + table(['Temps (s);Tension (V);Courant (A);Gaz (%)'], lambda k: (
-        f'{0.01 * k:.2f};{V[k]};{AMPS[k]};{100 * U[k]:.1f}'.replace('.', ','))), 0.01, True,
-                 True),
     'no_header': (table([], lambda k: f'{0.01 * k:.3f},{V[k]},', '\r\n'), 0.01, False, False),
     'edgetx_sticks': (table(['Date,Time,RxBt(V),Thr,TxBat(V)'],
                             lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},"
@@ -223,9 +200,6 @@ FORMS = {
                        lambda k: f"{k + 1},{V[k]:.6E},Volt DC,5.5,{clock(k, '%m/%d/%Y')},"
                                  f"{clock(k, '%H:%M:%S')},0.01,{0.01 * k:.9f},"), 0.01, False,
                  False),
-    'arbin': (table(['Data_Point,Date_Time,Test_Time(s),Step_Time(s),Current(A),Voltage(V)'],
-                    lambda k: f"{k},{clock(k, '%m/%d/%Y %H:%M:%S')},{9 + 0.01 * k:.4f},"
-                              f'{0.01 * k:.4f},{AMPS[k]},{V[k]}'), 0.01, False, True),
     'neware': (table(['Record ID,Realtime,Time(h:min:s.ms),Status,Current(mA),Voltage(mV)'],
                      lambda k: f"{k},{clock(k, '%Y-%m-%d %H:%M:%S')},00:00:{0.01 * k:06.3f},"
                                f'CC_DChg,{1e3 * AMPS[k]:.1f},{1e3 * V[k]:.0f}'), 0.01, False,
@@ -234,12 +208,6 @@ FORMS = {
                        'Delta_X\t0.01\t0.01', '***End_of_Header***\t\t\t',
                        'X_Value\tPack Voltage\tPack Current\tComment'],
                       lambda k: f'{0.01 * k:.6f}\t{V[k]}\t{AMPS[k]}\t'), 0.01, False, True),
-    'flukeview': (table(['"Meter","289"', '', 'Reading,Sample,Start Time,Max'],
-                        lambda k: f"{k},{V[k]} V DC,{clock(k, '%m/%d/%Y %H:%M:%S.%f')},"
-                                  f'{V[k] + 1:.3f} V DC'), 0.01, False, False),
-    'unit_ut61e': (table(['Number,Date,Time,Value,Unit,Range'], lambda k: (
-        f"{k},{clock(k, '%d.%m.%Y,%H:%M:%S.')}{10 * k % 1000:03d},{V[k]},V,Auto")), 0.01, False,
-                   False),
     'asammdf': (table(['timestamps,BMS_PackVoltage,BMS_PackCurrent'],
                       lambda k: f'{0.01 * k:.2f},{V[k]},{AMPS[k]}'), 0.01, False, True),
     'odrive': (table(['time [s];axis0.motor.current_control.Iq_measured;vbus_voltage;ibus'],
@@ -271,7 +239,6 @@ FORMS = {
     'libreoffice_de': (table(['Zeit (s),Spannung (V),Strom (A),Gas'], lambda k: ','.join(
         f'"{german(x)}"' if x % 1.0 else f'{x:.0f}' for x in (0.01 * k, V[k], AMPS[k], U[k]))),
                        0.01, True, True),
-    'robot': (table(['t,Ubat,duty'], lambda k: f'{0.01 * k},{V[k]},{U[k]}'), 0.01, True, False),
     'airdata_sticks': (table(['time(millisecond),voltage(v),rc_throttle(percent)'], lambda k: (
         f'{10 * k},{V[k]},{200 * U[k] - 100:.1f}')), 0.01, True, False),
     # Each row names the series of its value.
@@ -298,8 +265,6 @@ FORMS = {
         f'{k}\t{0.01 * k:.3f}\t{1e3 * V[k]:.0f}\t{1e3 * AMPS[k]:.0f}')), 0.01, False, True),
     'lecroy': (table(['LECROYWS3054,1,Waveform', '#1,26-Nov-2023 10:15:23,0', 'Time,Ampl'],
                      lambda k: f'{1e-5 * k:.6e},{V[k]}'), 1e-5, False, False),
-    'gwinstek': (table(['Vertical Units,V,', 'Sampling Period,1.000e-05,', 'Waveform Data,'],
-                       lambda k: f'{1e-5 * k:.4E},{V[k]},'), 1e-5, False, False),
     'matlab': (table(['Time,Voltage'], lambda k: clock(k, '%d-%b-%Y %H:%M:%S.%f') + f',{V[k]}'),
                0.01, False, False),
     # No names: of the columns beside the time, the first varies least.
@@ -335,8 +300,6 @@ FORMS = {
     # Several rows per stamp of a clock of whole seconds; the first is in part.
     'arduino_rtc': (table(['Time,Voltage(V),Current(A)'], lambda k: (
         f"{clock(k + 3, '%H:%M:%S', 0.1)},{V[k]},{AMPS[k]}")), 0.1, False, True),
-    'unit_log': (table(['No.,Date,Time,Value,Unit'], lambda k: (
-        f"{k + 1},{clock(k, '%Y/%m/%d,%H:%M:%S', 0.5)},{V[k]},V")), 0.5, False, False),
     'unix_seconds': (table(['unixtime,voltage,throttle'], lambda k: (
         f'{1700000000 + (k + 13) // 20},{V[k]},{U[k]}')), 0.05, True, False),
     # Rows are numbered; the name of the time has more words.
@@ -469,8 +432,6 @@ FORMS = {
     'excel_ch': (table(['Zeit (s);U_Akku (mV)'], lambda k: (
         f'{0.1 * k:.1f};' + thousands(1e3 * V[k]).replace('.', "'"))), 0.1, False, False),
     # One level that is left beside a throttle or has a supply's name; facts beside the first rows.
-    'lvm_akku': (table(['X_Value\tU_Akku\tGas\tComment'], lambda k: '\t'.join(
-        map(german, (round(0.1 * k, 1), V[k], U[k], '')))), 0.1, True, False),
     'supply': (table(['t,supply,command'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'), 0.1, False,
                False),
     'pwm': (table(['t,B1,pwm'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'), 0.1, True, False),
@@ -558,6 +519,9 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     # A point elsewhere shows that quoted commas separate thousands.
     (table(['time_s,U (mV)'], lambda k: f'{k / 100},"12,{k:03}"'), CsvColumns(), 0.01,
      12.0 + 1e-3 * K),
+    # Words of loggers for a missing number, and a factor in the unit of a column.
+    ('time,VBAT (x10 mV)\n0,1200\n1,OL\n2,∞\n3,----\n4,--.--\n5,1.#QNAN\n6,-1.#IND\n7,1210\n',
+     CsvColumns(), 7.0, [12.0, 12.1]),
     # UTF-16 without a mark of its byte order.
     (table(['Zeit;Spannung [V]'], lambda k: f'{german(k / 8)};{german(V[k])}').encode('utf-16-le'),
      CsvColumns(), 0.125, V),
@@ -864,14 +828,6 @@ def test_a_known_mark_makes_the_other_one_separate_thousands(delimiter, decimal,
     if quote:
         with pytest.raises(InputError, match='--'):
             read_recording(path)
-
-
-def test_words_of_loggers_for_a_missing_number(tmp_path):
-    """They are counted, not refused; a factor in the unit of a column is applied."""
-    words = ['OL', '∞', '----', '--.--', '1.#QNAN', '-1.#IND']
-    found = read_recording(written(tmp_path, 'time,VBAT (x10 mV)\n' + ''.join(
-        f'{k},{word}\n' for k, word in enumerate(['1200', *words, '1210']))))
-    assert found.voltage.tolist() == [12.0, pytest.approx(12.1)]
 
 
 @pytest.mark.parametrize('order', ['one after another', 'equal stamps', 'in turn'])
