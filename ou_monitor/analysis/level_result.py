@@ -38,11 +38,10 @@ import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.analysis.levels import LoadLevel
 from ou_monitor.analysis.noise import Remainder
-from ou_monitor.criticism.curves import even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, sampled_spectrum
 from ou_monitor.model.ou_fit import fit_pieces, white_variance
 from ou_monitor.model.spectral_lines import (
-    EvenGrid, find_lines, LineSearch, on_grid, without_lines)
+    even_on_log, EvenGrid, find_lines, LineSearch, on_grid, without_lines)
 from ou_monitor.online.estimator.quality import examine, input_flags
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, LOG_NAMES, NAN, OuFacts, Recording, Status)

@@ -17,7 +17,6 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.composite import Composite
-from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.score_statistics import criticise, NullBank
 from ou_monitor.discovery import decision
@@ -366,8 +365,10 @@ def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Compo
         best = top
 
 
-# Number of simulations whose range is compared.
-_DRAWS = 16
+# Number of simulations whose range is compared, and margin on either side of the recorded range,
+# as a share of it.  The extremes of two halves of a stationary flight differ by less; a wrong sag
+# or a growing drift moves them by more.
+_DRAWS, _MARGIN = 16, 0.5
 
 
 def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -> float:
@@ -384,3 +385,12 @@ def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -
 
     return float(np.quantile([stray(level(model.simulate(samples.t, rng, samples.throttle)),
                                     samples.logged) for _ in range(_DRAWS)], share))
+
+
+def stray(simulated: FloatArray, voltage: FloatArray) -> float:
+    """Return how far simulations leave a recorded range and its margin, V; inf if not finite."""
+    low, high = float(np.min(voltage)), float(np.max(voltage))
+    room = _MARGIN * (high - low)
+    if not np.isfinite(simulated).all():
+        return math.inf
+    return max(0.0, low - room - float(np.min(simulated)), float(np.max(simulated)) - high - room)

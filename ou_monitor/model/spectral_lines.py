@@ -299,3 +299,13 @@ def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> Fl
             without_sinusoids(piece, rate, (line.frequency,), line.resolution)
             for piece in np.array_split(voltage, pieces)])
     return voltage
+
+
+def even_on_log(x: FloatArray, y: FloatArray, per_decade: int) -> tuple[FloatArray, FloatArray]:
+    """Average a curve over increasing x > 0 in even bins of log x."""
+    if x.size < 3:
+        return x, y
+    bins = np.floor(per_decade * np.log10(x / x[0])).astype(np.intp)
+    count = np.bincount(bins)
+    some = count > 0
+    return np.bincount(bins, x)[some] / count[some], np.bincount(bins, y)[some] / count[some]

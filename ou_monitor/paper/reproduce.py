@@ -13,8 +13,8 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.criticism.curves import even_on_log
 from ou_monitor.model.ou import simulate
+from ou_monitor.model.spectral_lines import even_on_log
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import ACCoupling

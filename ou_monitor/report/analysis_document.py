@@ -15,7 +15,6 @@ from ou_monitor.analysis.level_tests import NARROW, sigma_change
 from ou_monitor.analysis.noise import BAND
 from ou_monitor.analysis.overview import answers, determined, FARTHEST, known_lines
 from ou_monitor.analysis.quality import faults, QualityItem
-from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import DEFAULT_LIMIT
 from ou_monitor.records import FloatArray, NAN, Recording, Severity
@@ -506,8 +505,8 @@ def _shape(analysis: Analysis) -> list[Part]:
         edges, density = level.density()
         if density.size:
             # An empty bin cannot be drawn on a logarithmic axis.
-            histogram.line(*outline(edges, np.where(density > 0.0, density, np.nan)),
-                           level.label, k)
+            shown = np.where(density > 0.0, density, np.nan)
+            histogram.steps(edges, np.append(shown, shown[-1]), level.label, k)
     figures = [Figure(plot) for plot in (spectrum, histogram) if plot.curves]
     if not figures:
         return [Text('No level holds enough samples for a spectrum.', legend=True)]

@@ -7,7 +7,6 @@ from functools import partial
 import math
 
 import numpy as np
-from ou_monitor.criticism.curves import outline
 from ou_monitor.paper import oscilloscope, published
 from ou_monitor.paper.published import Row
 from ou_monitor.paper.reproduce import (
@@ -135,7 +134,7 @@ def _crests(result: Reproduction) -> list[Part]:
     edges = np.linspace(2.5, 10.0, 1 + _BINS)
     for k, (ms, values) in enumerate(sorted(result.crests.by_screen.items())):
         share, _ = np.histogram(values, edges, density=True)
-        crests.line(*outline(edges, share), f'{ms} ms', k)
+        crests.steps(edges, np.append(share, share[-1]), f'{ms} ms', k)
     crests.limits(x=(2.5, 10.0), y=(0.0, 1.15))
     for state in published.LOADED:
         crests.mark(state.crest, state.label)

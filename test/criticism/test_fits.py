@@ -7,12 +7,12 @@ import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism import structure
 from ou_monitor.criticism.composite import _converged, fit_composite
-from ou_monitor.criticism.curves import outline, stray
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import design_of, evaluate, Events, solved, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.discovery.fitting import from_spectrum, standard_errors
 from ou_monitor.discovery.gain import guess
+from ou_monitor.discovery.search import stray
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadSag
@@ -251,13 +251,6 @@ def test_events_add_to_the_joint_normal_law():
     # What an event adds at its own sample is not in the variance there.
     own = (power - 1.0) / power * (added - push) + push + error + (white - 1.0) * std**2
     assert_allclose(found.variance, np.diag(known)**2 - own, rtol=1e-3)
-
-
-def test_the_outline_of_a_histogram_encloses_the_area_of_its_bars():
-    """Up, along, down: the area below is that of the bars."""
-    x, y = outline(np.array([0.0, 1.0, 3.0]), [2.0, 1.0])
-    assert float(np.sum(np.diff(x) * 0.5 * (y[1:] + y[:-1]))) == pytest.approx(4.0)
-    assert x[0] == 0.0 and x[-1] == 3.0 and y.max() == 2.0
 
 
 def test_simulations_may_exceed_the_recorded_range_by_half_of_it():
