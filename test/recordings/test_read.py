@@ -369,9 +369,6 @@ def test_a_topic_of_its_own_goes_first_and_holds(tmp_path):
 
 def test_missing_current_is_none(tmp_path):
     assert read_recording(bag_with_currents(tmp_path / 'a.mcap', [np.nan] * 5)).current is None
-    path = tmp_path / 'a.csv'
-    path.write_text('time_s,voltage_v\n0,5\n1,5\n')
-    assert read_recording(path).current is None
 
 
 @pytest.mark.parametrize('header, row', [

@@ -147,11 +147,6 @@ def test_a_name_lost_with_the_end_of_a_log():
         choose(PATH, log, voltage='v')
 
 
-def test_values_that_no_message_holds_are_dropped():
-    mended, notes = clean(series(values=(5.0, 1e300, 5.2)))
-    assert mended.values.tolist() == [5.0, 5.2] and 'beyond 1e+09' in notes[0]
-
-
 def test_two_throttles_of_one_rank_need_a_choice():
     log = Log('x', (series(), series('a', THROTTLE), series('b', THROTTLE)))
     with pytest.raises(InputError, match='several throttle series: a .*b .*--throttle'):
@@ -183,29 +178,22 @@ def test_unusable_samples_are_dropped_with_a_note():
     assert 24 - mended.n == sum(int(note.split()[0]) for note in notes)
 
 
-def test_a_sample_every_few_hours():
-    t = 7200.0 * np.arange(50)
-    mended, notes = clean(series(t=t, values=np.arange(50.0)))
-    assert mended.n == 50 and notes == ()
+COUNT = np.arange(100.0)
 
 
-def test_a_lone_wrong_stamp_costs_one_sample():
-    for wrong in (0.0, 500.0):
-        t = np.arange(100.0)
-        t[50] = wrong
-        mended, notes = clean(series(t=t, values=np.arange(100.0)))
-        assert mended.n == 99 and 50.0 not in mended.values
-        assert len(notes) == 1
-
-
-def test_throttle_is_a_share():
-    """Values beyond 0..1 are clipped, with a note if the excess is more than rounding."""
-    mended, notes = clean(series('u', THROTTLE, values=(-0.001, 0.5, 1.002)))
-    np.testing.assert_array_equal(mended.values, [0.0, 0.5, 1.0])
-    assert notes == ()
-    mended, notes = clean(series('u', THROTTLE, values=(-0.1, 0.5, 1.4)))
-    np.testing.assert_array_equal(mended.values, [0.0, 0.5, 1.0])
-    assert '2 values outside 0..1' in notes[0]
+@pytest.mark.parametrize('quantity, t, values, kept, words', [
+    (VOLTAGE, COUNT[:3], (5.0, 1e300, 5.2), (5.0, 5.2), ['beyond 1e+09']),
+    # A sample every few hours; a lone wrong stamp costs one sample.
+    (VOLTAGE, 7200.0 * COUNT, COUNT, COUNT, []),
+    *((VOLTAGE, np.where(COUNT == 50.0, wrong, COUNT), COUNT, COUNT[COUNT != 50.0], ['1 sample'])
+      for wrong in (0.0, 500.0)),
+    # A share beyond 0..1 is clipped, with a note if the excess is more than rounding.
+    (THROTTLE, COUNT[:3], (-0.001, 0.5, 1.002), (0.0, 0.5, 1.0), []),
+    (THROTTLE, COUNT[:3], (-0.1, 0.5, 1.4), (0.0, 0.5, 1.0), ['2 values outside 0..1'])])
+def test_what_is_kept_of_a_series(quantity, t, values, kept, words):
+    mended, notes = clean(series('u', quantity, t, values))
+    np.testing.assert_array_equal(mended.values, kept)
+    assert len(notes) == len(words) and all(map(str.__contains__, notes, words))
 
 
 def test_a_voltage_without_usable_samples_is_refused():
