@@ -70,7 +70,8 @@ class LoadStatus(enum.Enum):
                    'under load.')
     STILL = 'Throttle has moved by less than 2 %: too little for a sag over throttle.'
     UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
-    RISES = 'The voltage rises with throttle: check topic, unit and sign of throttle.'
+    RISES = ('The voltage rises with throttle; unless a regulator raises it, check topic, unit '
+             'and sign of throttle.')
     NO_RELATION = ('The voltage does not fall with throttle, as on a regulated rail; on a '
                    'battery, check topic, unit and sign of throttle.')
 
