@@ -154,6 +154,19 @@ def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
         assert (found.n - 1) / found.duration == pytest.approx(rate, rel=1.0 / 315)
         for name in ('t', 'voltage', 'throttle', 'current'):
             np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+    if wanted.n > 5000:
+        return
+    answers = []
+    for one in (path, sheet, bag):
+        # Only a log states cells and a limit of its own.
+        assert main(['analyze', str(one), '--cells', '4', '--brownout-voltage', '2.5', '--json',
+                     str(tmp_path / 'out.json'), '--force']) == 0
+        answers.append(json.loads((tmp_path / 'out.json').read_text()))
+        # How the file was read differs (`quality` holds the notes on that too), nothing else.
+        for name in ('recording', 'source', 'notes', 'quality'):
+            del answers[-1][name]
+    assert answers[0] == answers[1] == answers[2]
+    assert 'sag' in json.dumps(answers[0])
 
 
 def test_columns_and_units_of_a_csv(tmp_path):
