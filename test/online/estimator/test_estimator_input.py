@@ -8,7 +8,7 @@ from ou_monitor import SlidingEstimator
 from ou_monitor.records import Counters, Status
 from pushed import pushed
 import pytest
-from simulated_windows import DT, paths, stamps
+from simulated_windows import DT, estimate, paths, stamps
 
 N = 1000
 T = stamps(N)
@@ -60,8 +60,7 @@ def test_nothing_and_one_sample():
 
 def test_a_fit_needs_twenty_samples():
     for n in (19, 20):
-        estimator = pushed(SlidingEstimator(2.0), T[:n], Y[:n])
-        assert (estimator.estimate().status is Status.TOO_FEW_SAMPLES) == (n < 20)
+        assert (estimate(T[:n], Y[:n], window=2.0).status is Status.TOO_FEW_SAMPLES) == (n < 20)
 
 
 def test_non_finite_samples_are_dropped_and_counted():
@@ -69,13 +68,10 @@ def test_non_finite_samples_are_dropped_and_counted():
     y[[3, 500]] = np.nan, np.inf
     t[[10, 700]] = -np.inf, np.nan
     good = np.isfinite(t) & np.isfinite(y)
-    one = pushed(SlidingEstimator(2.0), t, y)
-    two = pushed(SlidingEstimator(2.0), t[good], y[good])
-    a, b = one.estimate(), two.estimate()
+    a, b = estimate(t, y, window=2.0), estimate(t[good], y[good], window=2.0)
     assert a.counters == Counters(pushed=N, used=N - 4, non_finite=4)
     assert a.alpha == pytest.approx(b.alpha, rel=1e-12) and a.n == N - 4
-    only = pushed(SlidingEstimator(2.0), [0.0, np.nan], [np.nan, 5.0])
-    e = only.estimate()
+    e = estimate([0.0, np.nan], [np.nan, 5.0], window=2.0)
     assert e.status is Status.NO_DATA and e.counters == Counters(pushed=2, non_finite=2)
 
 
@@ -83,12 +79,10 @@ def test_late_samples_in_one_batch_are_sorted_in():
     order = np.random.default_rng(42).permutation(N)
     # The first stamp stays first: what comes before the window begins is another matter.
     order = np.concatenate([[0], order[order != 0]])
-    one = pushed(SlidingEstimator(2.0), T, Y)
-    two = pushed(SlidingEstimator(2.0), T[order], Y[order])
-    alike(one.estimate(), two.estimate(), rel=1e-12)
-    assert two.estimate().counters == Counters(pushed=N, used=N)
-    three = pushed(SlidingEstimator(2.0), np.append(T, T[-1]), np.append(Y, 99.0))
-    e = three.estimate()
+    e = estimate(T[order], Y[order], window=2.0)
+    alike(estimate(T, Y, window=2.0), e, rel=1e-12)
+    assert e.counters == Counters(pushed=N, used=N)
+    e = estimate(np.append(T, T[-1]), np.append(Y, 99.0), window=2.0)
     assert e.counters == Counters(pushed=N + 1, used=N, late=1) and e.voltage == Y[-1]
 
 

@@ -120,8 +120,7 @@ def test_float32_and_lists():
     one = estimate(T, y)
     two = estimate(T, y.astype(np.float64))
     assert (one.alpha, one.sigma, one.u0, one.n) == (two.alpha, two.sigma, two.u0, two.n)
-    estimator = pushed(SlidingEstimator(2.1), T.tolist(), y.tolist())
-    assert estimator.estimate().alpha == pytest.approx(two.alpha, rel=1e-9)
+    assert estimate(T.tolist(), y.tolist(), window=2.1).alpha == pytest.approx(two.alpha, rel=1e-9)
     assert one.alpha == pytest.approx(
         estimate(T, y + 1e-9).alpha, rel=1e-4)
 

@@ -116,9 +116,8 @@ def test_no_drift_and_bounded_memory():
     assert end - begin < 4e6 and peak < 3e7
     e = old.estimate()
     assert e.counters == Counters(pushed=10_000 * blocks, used=10_000 * blocks)
-    new = pushed(SlidingEstimator(2.0), (blocks - 1) * 10.0 + t, y)
     # New searches start elsewhere, which is 1e-6.
-    fresh = new.estimate()
+    fresh = estimate((blocks - 1) * 10.0 + t, y, window=2.0)
     assert (e.n, e.status) == (fresh.n, fresh.status)
     assert numbers(e)[:5] == pytest.approx(numbers(fresh)[:5], rel=1e-5)
 
@@ -190,8 +189,7 @@ def test_repeats_of_a_fast_source_are_seen_before_it_is_thinned():
     """Each value twice at 20 kHz: nothing is cleared to drop them, half of all are held."""
     n = 10_000
     y = np.repeat(paths(np.random.default_rng(6), 1, n // 2, 1e-4)[0], 2)
-    estimator = pushed(SlidingEstimator(1.0), stamps(n, 5e-5), y)
-    e = estimator.estimate()
+    e = estimate(stamps(n, 5e-5), y, window=1.0)
     assert e.counters.resets == 0 and Flag.HELD_SAMPLES in e.flags
     assert e.counters.held == pytest.approx(n / 2, abs=2) and e.n == pytest.approx(n / 2, abs=2)
 
@@ -203,8 +201,7 @@ def test_quality_is_that_of_the_newest_thousand(since, told):
     low = 2000 - since
     y[low:low + 400] = np.minimum(y[low:low + 400], LEVEL)
     y[low:low + 400] = np.where(y[low:low + 400] == LEVEL, y.max() + 0.01, y[low:low + 400])
-    estimator = pushed(SlidingEstimator(2.1), stamps(2000), y)
-    assert (Flag.SATURATED in estimator.estimate().flags) is told
+    assert (Flag.SATURATED in estimate(stamps(2000), y, window=2.1).flags) is told
 
 
 @pytest.mark.parametrize('window, step, n', [(2.0, 1.0, 3), (0.5, 1.0, 1)])
@@ -227,11 +224,8 @@ def test_trends_are_few_where_there_is_none_and_seen_where_there_is():
     drift = 8.0 * SIGMA / math.sqrt(2.0 * ALPHA)
 
     def share(windows):
-        told = 0
-        for y in windows:
-            estimator = pushed(SlidingEstimator(1.0), stamps(y.size), y)
-            told += Flag.TREND in estimator.estimate().flags
-        return told / len(windows)
+        return np.mean([Flag.TREND in estimate(stamps(y.size), y, window=1.0).flags
+                        for y in windows])
 
     assert share(walks) <= 0.085
     assert share(paths(rng, 400, 100)) <= 0.02

@@ -3,9 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor import SlidingEstimator
 from ou_monitor.records import Flag, Status
-from pushed import pushed
 import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, estimate, LEVEL, paths, stamps
@@ -95,8 +93,7 @@ STATUS = {
 @pytest.mark.parametrize('status', STATUS, ids=lambda s: s.name)
 def test_each_status_has_numbers_only_where_they_may_be_used(status):
     t, y = STATUS[status]()
-    estimator = pushed(SlidingEstimator(2.1), t, y)
-    e = estimator.estimate()
+    e = estimate(t, y, window=2.1)
     # A random walk looks like a few relaxations as often as like none.
     assert e.status is status or {e.status, status} == {Status.TOO_SHORT, Status.UNBOUND}
     assert len(status.value.split()) >= 3

@@ -5,7 +5,6 @@ import math
 
 from hypothesis import given, strategies as st
 import numpy as np
-from ou_monitor import SlidingEstimator
 from ou_monitor.analysis.analyze import analyze, as_data
 from ou_monitor.analysis.level_tests import alpha_constancy, sigma_change
 from ou_monitor.online.estimator.fit import FitEnd, WindowFit
@@ -14,8 +13,8 @@ from ou_monitor.records import (
     Counters, Estimate, Flag, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status)
 from ou_monitor.report.analysis_document import analysis_document
 from ou_monitor.report.terminal import terminal
-from pushed import pushed
 import pytest
+from simulated_windows import estimate
 
 
 NAN = math.nan
@@ -192,7 +191,6 @@ def test_a_ratio_follows_the_same_rule():
 @pytest.mark.parametrize('seed', [3, 122])
 def test_the_estimator_publishes_nothing_of_it(seed):
     recording = nearly_white(seed)
-    estimator = pushed(SlidingEstimator(window=10.0), recording.t, recording.voltage)
-    e = estimator.estimate()
+    e = estimate(recording.t, recording.voltage, window=10.0)
     assert e.status in (Status.BURIED, Status.NO_RELAXATION)
     assert all(math.isnan(getattr(e, name)) for name in NAMES)

@@ -304,8 +304,7 @@ def test_noise_counts_the_changes_of_throttle_as_flown():
     u = np.clip(0.4 + 0.15 * rng.standard_normal(301), 0.0, 1.0)[(5 * t).astype(int)]
     moved = np.diff(u, prepend=u[0]) != 0.0
     noise = np.where(moved, 0.2, 0.02) * rng.standard_normal(t.size)
-    loads = pushed(LoadFilter(), t, 16.0 - 1.5 * u ** 1.8 + noise, u)
-    load = loads.load()
+    load = loaded(t, 16.0 - 1.5 * u ** 1.8 + noise, u)
     for throttle in (0.3, 0.4, 0.5):
         near = np.abs(u - throttle) < 0.05
         measured = float(np.sqrt(np.mean(noise[near] ** 2)))
@@ -322,8 +321,7 @@ def test_a_sag_known_only_between_throttles_keeps_its_rise():
     u = 0.62 + 0.17 * np.sin(0.7 * t) * np.sin(0.05 * t)
     sag = 0.05 + 0.9 * np.maximum(u - 0.45, 0.0)**1.8
     v = 3.9 - sag - 0.001 * t + 0.002 * np.random.default_rng(3).standard_normal(t.size)
-    load_filter = pushed(LoadFilter(), t, v, u)
-    load = load_filter.load()
+    load = loaded(t, v, u)
     rises = np.diff(load.sag(np.linspace(0.0, 1.0, 21)))
     assert load.known and (rises > -1e-9).all()
     low, high = np.interp((0.5, 0.75), u[np.argsort(u)], sag[np.argsort(u)])
@@ -364,9 +362,7 @@ def test_a_short_climb_keeps_the_sag_known():
     rng = np.random.default_rng(3)
     t = np.arange(0.0, 240.0, 0.1)
     u = np.where(t < 4.0, 0.0, np.where((t > 100.0) & (t < 115.0), 0.9, 0.55))
-    filtered = LoadFilter()
-    filtered.push(t, 8.2 - 0.8 * u ** 1.5 + 0.01 * rng.standard_normal(t.size), u)
-    load = filtered.load()
+    load = loaded(t, 8.2 - 0.8 * u ** 1.5 + 0.01 * rng.standard_normal(t.size), u)
     assert load.known
     assert abs(float(load.sag(0.9)) - 0.8 * 0.9 ** 1.5) < 2.0 * float(load.sag_se(0.9))
 

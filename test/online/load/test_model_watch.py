@@ -41,6 +41,11 @@ def watched(model, made, voltage=1.0):
     return monitor.report(0.0)
 
 
+def taught(made):
+    """Return what a filter learns of a flight."""
+    return pushed(LoadFilter(), made.t, made.voltage, made.throttle, made.current).learned()
+
+
 @pytest.mark.parametrize('age, verdict', [
     (1.0, ModelVerdict.AS_MODEL), (1.2, ModelVerdict.WEAKER), (1.4, ModelVerdict.WEAKER)])
 def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
@@ -81,8 +86,7 @@ def test_the_noise_ratio_is_1_whatever_rate_and_throttle(noise):
         u = throttle(t)
         return t, model.simulate(t, np.random.default_rng(seed), u), u
 
-    loads = pushed(LoadFilter(), *flown(FLOWN, 120.0, 100.0, 99))
-    start = loads.learned()
+    start = pushed(LoadFilter(), *flown(FLOWN, 120.0, 100.0, 99)).learned()
 
     def compared(throttle, rate, seed, more=0.0):
         t, voltage, u = flown(throttle, 60.0, rate, seed)
@@ -142,11 +146,7 @@ def test_a_model_that_is_set_in_flight_is_compared_with_all_of_it():
 
 def test_what_is_learned_is_of_the_whole_flight():
     """Two flights of one pack teach the same answer, whatever their last half minute was like."""
-    found = []
-    for seed in (7, 99):
-        taught, made = LoadFilter(), flight(120.0, seed)
-        taught.push(made.t, made.voltage, made.throttle)
-        found.append(taught.learned())
+    found = [taught(flight(120.0, seed)) for seed in (7, 99)]
     high = np.power(0.35, [1.8, 1.0, 3.0, 1.8])
     sags = [float(high @ one.coefficients[:4]) for one in found]
     assert abs(sags[0] / sags[1] - 1.0) < 0.06
@@ -163,9 +163,7 @@ def test_resistance_is_compared_where_a_current_is_measured():
         return Recording(t, 16.0 - ohm * current + 0.02 * rng.standard_normal(t.size), u,
                          'made', current=current)
 
-    taught, first = LoadFilter(), made(0.020)
-    taught.push(first.t, first.voltage, first.throttle, first.current)
-    model = SupplyModel(GECKO.terms, taught.learned())
+    model = SupplyModel(GECKO.terms, taught(made(0.020)))
     old = made(0.026)
     for one, ratio in ((model, 1.3), (GECKO, math.nan)):
         monitor = SupplyMonitor(MonitorSettings(window=2.0), one)
@@ -189,11 +187,6 @@ def against(start, made):
         loads.push(made.t[part], made.voltage[part], made.throttle[part])
         found.append(loads.against(start))
     return found
-
-
-def taught(made):
-    loads = pushed(LoadFilter(), made.t, made.voltage, made.throttle)
-    return loads.learned()
 
 
 @pytest.mark.parametrize('age, verdict', [
