@@ -137,16 +137,9 @@ def run_fleet(found: SearchResult, folder: Path, options: Options, version: Call
     """Analyse all unfinished recordings, and judge the fleet."""
     saved = SavedResults(folder, {**asdict(options), 'version': version()})
     twice = duplicates(found.sources, comparing)
-    results: dict[Path, dict[str, Any]] = {}
-    missing: list[FoundRecording] = []
-    for source in found.sources:
-        if source.path in twice:
-            continue
-        known = saved.load(source)
-        if known is None:
-            missing.append(source)
-        else:
-            results[source.path] = known
+    known = {source: saved.load(source) for source in found.sources if source.path not in twice}
+    missing = [source for source, result in known.items() if result is None]
+    results = {source.path: result for source, result in known.items() if result is not None}
     if missing:
         with (LocalWorkers(min(workers, len(missing))) if scheduler is None else
               ClusterWorkers(scheduler, version, insecure)) as pool:
