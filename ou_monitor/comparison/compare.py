@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -131,8 +131,16 @@ class ComparedNumber:
         return np.asarray(_WEIGHTS[self.kind] * np.abs(off) / half)
 
 
-# The fields of a `ComparedNumber` up to `measured`.
-_Number = tuple[str, str, str, int, float, tuple[float, ...], float]
+class _Number(NamedTuple):
+    """A number of one voltage; the fields are those of `ComparedNumber` up to `measured`."""
+
+    kind: str
+    name: str
+    unit: str
+    digits: int
+    least: float
+    at: tuple[float, ...]
+    measured: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,34 +271,36 @@ class Yardstick:
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
         volts = max(_RANGE * self._spread, 1e-12)
-        found: list[_Number] = [
-            ('lowest', 'lowest voltage', 'V', 4, volts, (), float(v.min())),
-            ('level', 'mean voltage', 'V', 4, volts, (), float(v.mean()))]
+        found = [_Number('lowest', 'lowest voltage', 'V', 4, volts, (), float(v.min())),
+                 _Number('level', 'mean voltage', 'V', 4, volts, (), float(v.mean()))]
         for level in self.levels:
             count = dip_begins(v, level, self._rise).size
             # The Poisson error of the count, at least.
             least = max((_RATE - 1.0) * count, math.sqrt(max(count, 1)))
-            found.append(('dips', f'dips below {round(level, 3):g} V', '1/min', 3,
-                          least / self._minutes, (level,), count / self._minutes))
+            found.append(_Number('dips', f'dips below {round(level, 3):g} V', '1/min', 3,
+                                 least / self._minutes, (level,), count / self._minutes))
         response = np.empty(0)
         if self.rises.size >= _FEWEST:
             around = np.interp(self.rises[:, None] + self.after, self._t, v)
             before = around[:, self.after < 0.0].mean(axis=1, keepdims=True)
             response = (around - before).mean(axis=0)
             begin, later = np.searchsorted(self.after, [0.0, RECOVERED]).tolist()
-            found += [('answer', 'fall after rises', 'V', 3, volts, (), -response[begin:].min()),
-                      ('answer', 'fall left after 1 s', 'V', 3, volts, (), -response[later])]
+            found += [_Number('answer', name, 'V', 3, volts, (), -float(low)) for name, low in (
+                ('fall after rises', response[begin:].min()),
+                ('fall left after 1 s', response[later]))]
         f, density = welch(v, self._rate, nperseg=self._segment)
         power = f[1] * np.histogram(
             np.minimum(f, self._bands[-1]), self._bands, weights=density)[0]
-        found += [('spectrum', f'rms {number(low, 2)} to {number(high, 2)} Hz', 'V', 3,
-                   math.log(_POWER), (low, high), math.sqrt(one))
-                  for low, high, one in zip(self._bands.tolist(), self._bands[1:].tolist(), power)]
+        found += [
+            _Number('spectrum', f'rms {number(low, 2)} to {number(high, 2)} Hz', 'V', 3,
+                    math.log(_POWER), (low, high), math.sqrt(one))
+            for low, high, one in zip(self._bands.tolist(), self._bands[1:].tolist(), power)]
         if self._line is not None:
             at, width = self._line.frequency, self._line.resolution
             f, density = welch(v, self._rate, nperseg=min(v.size, round(self._rate / width)))
-            found.append(('line', f'rms at {number(at, 4)} Hz (line)', 'V', 3, volts, (at,),
-                          math.sqrt(width * density[np.abs(f - at) <= LOBE * width].sum())))
+            found.append(_Number(
+                'line', f'rms at {number(at, 4)} Hz (line)', 'V', 3, volts, (at,),
+                math.sqrt(width * density[np.abs(f - at) <= LOBE * width].sum())))
         return Measures(found, response,
                         np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
@@ -298,10 +308,10 @@ class Yardstick:
 def rows_of(measured: Sequence[Measures]) -> list[ComparedNumber]:
     """Return the rows of a table, from the recording's measures and each simulation's."""
     pooled = np.mean([one.distribution for one in measured], axis=0)
-    every: list[list[_Number]] = [[*one.numbers, (
+    every = [[*one.numbers, _Number(
         'ks', 'distribution (KS distance)', '', 2, _KS, (),
         float(np.abs(one.distribution - pooled).max()))] for one in measured]
-    return [ComparedNumber(*own, np.array([other[k][-1] for other in every[1:]]))
+    return [ComparedNumber(*own, np.array([other[k].measured for other in every[1:]]))
             for k, own in enumerate(every[0])]
 
 

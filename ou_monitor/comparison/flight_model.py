@@ -33,8 +33,9 @@ from scipy.special import softmax
 # Errors are drawn from the readings of the nearest noise sizes: share of all readings, and minimum
 # number, on either side; difference of ln(size) up to which sizes count as equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
-# Time constant below which changes of a path may be damped, s (with 0.02 or the best of 0.01 to
-# 0.64, 19 recordings of flights and rails get the same verdicts).
+# Time constant below which changes of a path may be damped, s (0.02 or the best of 0.01 to 0.64:
+# the same verdicts on gecko, roma, hiro, erle, nazgul, bf3s, cf_takeoff, cf_pair, frc_ol_1, euc_1,
+# hebi_x, js_11t, as_f60, px_tg1, mm_bench_1, xt_pico, regbot_28, regbot_81 and bags/flight).
 _FAST_TIME = 0.02
 # Number of parts that are held out in turn.
 _PARTS = 4
