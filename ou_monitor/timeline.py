@@ -258,6 +258,14 @@ def scatter_words(t: FloatArray, least: float) -> str:
             f'({1e3 * usual:.3g} ms)') * (scatter > least)
 
 
+def pause_words(t: FloatArray) -> str:
+    """Return the pauses between stamps, s, as the end of a sentence; empty without one."""
+    steps = np.diff(t)
+    long = steps[steps > GAP_STEPS * np.median(steps)] if steps.size > 1 else steps[:0]
+    return (f'; {counted(long.size, "pause")} without usable samples, {float(long.sum()):.3g} s '
+            f'in all, the longest {float(long.max()):.3g} s') if long.size else ''
+
+
 def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
     """Return the even grid nearest to stamps (t in s, number of steps between them, result s)."""
     k = np.concatenate(([0.0], np.cumsum(number)))

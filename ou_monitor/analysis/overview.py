@@ -23,6 +23,7 @@ from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts
+from ou_monitor.timeline import pause_words, supplied
 
 # Largest extrapolated sag that is given, relative to the level: a source with a resistance gives
 # the most power at half its voltage.
@@ -73,6 +74,7 @@ class Overview:
     # than `facts.ou` and agrees with it.
     whole: OuFacts | None = None
     beware: tuple[str, ...] = ()  # Warnings that change the meaning of every number
+    pauses: str = ''  # Times without usable samples, as the end of a sentence
 
     @property
     def limit(self) -> float:
@@ -106,7 +108,7 @@ def overview(recording: Recording, limit: float | None = None,
                     _largest(recording), _growth(recording, facts.noise.rms_v, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
-                    beware(recording, cells))
+                    beware(recording, cells), pause_words(supplied(recording).t))
 
 
 def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:

@@ -21,8 +21,7 @@ from ou_monitor.criticism.readings import why_stuck
 from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import (
     clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
-from ou_monitor.text import counted
-from ou_monitor.timeline import GAP_STEPS, scatter_words
+from ou_monitor.timeline import pause_words, scatter_words
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -137,17 +136,12 @@ def _unit_items(recording: Recording) -> list[QualityItem]:
 
 
 def _stamp_items(recording: Recording) -> list[QualityItem]:
-    steps = np.diff(recording.t)
-    if steps.size < 2:
+    if recording.n < 3:
         return []
     items = []
-    median = float(np.median(steps))
-    pauses = steps > GAP_STEPS * median
-    if pauses.any():
-        items.append(QualityItem('PAUSES', Severity.WARNING, (
-            f'{counted(int(pauses.sum()), "pause")} without usable samples, '
-            f'{float(steps[pauses].sum()):.3g} s in all, the longest '
-            f'{float(steps.max()):.3g} s; no level spans a pause.')))
+    if pauses := pause_words(recording.t):
+        items.append(QualityItem('PAUSES', Severity.WARNING,
+                                 f'{pauses[2:]}; no level spans a pause.'))
     if scatter := scatter_words(recording.t, _UNEVEN):
         items.append(QualityItem('UNEVEN_CLOCK', Severity.INFO,
                                  f'{scatter}: the spectra assume even steps.'))

@@ -41,7 +41,7 @@ def analysis_document(analysis: Analysis) -> Document:
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
     subject = (f'{recording.name}: {recording.n} samples in '
-               f'{recording.duration:.4g} s ({number(rate)} Hz)')
+               f'{recording.duration:.4g} s ({number(rate)} Hz){analysis.overview.pauses}')
     parts: list[Part] = [
         lambda: [Figure(_with_segments(voltage_plot(recording, analysis.overview.limit),
                                        analysis))],

@@ -28,7 +28,7 @@ def comparison_document(found: Agreement, seen: Overview) -> Document:
                   f'fitted 0 to {number(found.fitted[1], 4)} s, ')
                + f'simulated {number(first, 4)} to {number(last, 4)} s'
                + (' with the model given' if found.fitted == _NOTHING else '')
-               + f'; model: {", ".join(found.model)}')
+               + f'; model: {", ".join(found.model)}{seen.pauses}')
     parts: list[Part] = [
         lambda: [Figure(_voltage(found), _VOLTAGE)],
         Table(['', 'measured', 'simulated\n[95 %]', ''], _rows(found), left=[0, 3]),

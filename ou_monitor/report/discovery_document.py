@@ -38,7 +38,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None) -> Docume
     load = (f'; load: the measured current, 1 = {number(finding.full)} A'
             if finding.load == 'current' else '')
     subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
-               f'{number(finding.duration, 4)} s{used}{load}')
+               f'{number(finding.duration, 4)} s{used}{load}{"" if seen is None else seen.pauses}')
     known = [] if seen is None else known_lines(seen)
     parts: list[Part] = [
         lambda: [] if samples is None else [Figure(_voltage(finding), (

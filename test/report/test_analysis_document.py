@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+from ou_monitor import bench
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.quality import quality_list
 from ou_monitor.analysis.supply import Dip, Dips
-from ou_monitor.records import Flag, Severity
+from ou_monitor.records import Flag, Recording, Severity
 from ou_monitor.report.analysis_document import analysis_document, answer, facts, notes
 import pytest
+from simulated_packs import flown
 from simulated_recordings import recording
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
@@ -131,3 +133,16 @@ def test_a_limit_per_cell_for_a_whole_pack_is_questioned(limit, warned):
     flown = replace(flown, voltage=10.9 + flown.voltage)
     said = ' '.join(answer(analyze(flown, brownout_voltage=limit)))
     assert ('0.82 V per cell if this is a pack of 4 cells' in said) == warned
+
+
+@pytest.mark.parametrize('command', [bench.analyze, bench.compare, bench.discover])
+def test_the_first_line_says_that_the_log_pauses(command):
+    """A link that is lost for 20 s, or a supply that is off for 5 s; nothing of a whole log."""
+    t, v, u = flown(1)
+    there = (t < 10.0) | (t > 30.0)
+    off = np.where((t > 20.0) & (t < 25.0), 0.0, v)
+    for samples, words in (((t[there], v[there], u[there]), '20 s in all'),
+                           ((t, off, u), '5 s in all'), ((t, v, u), '')):
+        subject = command(Recording(*samples)).document().subject
+        assert ('; 1 pause without usable samples, ' in subject) == bool(words)
+        assert words in subject
