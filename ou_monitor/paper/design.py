@@ -356,10 +356,10 @@ def answer(result: Design) -> str:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
                 f'the risk under {result.target:g}: with the largest it is still '
                 f'{probability(result.rows[-1].risk)}. {_others(result)}')
-    cure = (' Raise regulator_voltage or lower the level.' if result.rail != 'bus' else
+    cure = (' Raise regulator_voltage or lower the limit.' if result.rail != 'bus' else
             '' if result.voltage < result.network.battery_voltage else
-            ' The level is at or above the open-circuit voltage: check cells and battery_voltage, '
-            'or lower the level.')
+            ' The limit is at or above the open-circuit voltage: check cells and battery_voltage, '
+            'or lower the limit.')
     return (f'No capacitor helps: the mean, {present.mean:.4g} V, is at or below '
             f'{result.voltage:g} V. {_others(result)}{cure}')
 

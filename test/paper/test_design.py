@@ -101,7 +101,7 @@ def test_no_capacitor_helps_below_the_level():
 def test_a_level_above_the_battery_is_said_so():
     result = design(PowerNetwork(), 0.4, voltage=23.0, horizon=5.0, risk=1e-3)
     assert result.verdict is DesignVerdict.LEVEL
-    assert 'open-circuit' in answer(result)
+    assert 'The limit is at or above the open-circuit' in answer(result)
     regulated = design(PowerNetwork(), 0.4, rail='regulated', voltage=5.0, horizon=5.0, risk=1e-3)
     assert regulated.verdict is DesignVerdict.LEVEL and 'regulator_voltage' in answer(regulated)
 
