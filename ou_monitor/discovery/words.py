@@ -189,7 +189,7 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
         both_names(cause.name, plain_name(cause.term)) for cause in order))
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
-    closer = 'With them the simulation ' + (
+    closer = f'With {"it" if len(names) == 1 else "them"} the simulation ' + (
         'passes every test' if found.verdict is Verdict.EXPLAINED else
         'comes closer, but is not yet right' if found.closer else 'does not come closer')
     refused = [f'{found.refused}: trust the named causes, not the fitted values.'
