@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult, ProcessType
-from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
+from ou_monitor.analysis.noise import BAND, flown_near, Noise, Remainder, THROTTLES
 from ou_monitor.analysis.quality import beware
 from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
 from ou_monitor.criticism.readings import on_time
@@ -64,7 +64,8 @@ class Overview:
     flown: tuple[int, int]
     # Largest current, A, after a median of three readings; positive lowers the voltage; NaN: none.
     drawn: float = NAN
-    # Ratio of the noise at the highest throttle flown to the noise at the lowest, from a fit.
+    # Ratio of the noise at the highest throttle flown to the noise at the lowest, from a fit; 1 if
+    # it is within its error.
     growth: float = 1.0
     step: float = 0.0  # Median time between readings, s
     line: LoudestLine | None = None
@@ -105,20 +106,26 @@ def overview(recording: Recording, limit: float | None = None,
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
-                    _largest(recording), _growth(recording, facts.noise.rms_v, near),
+                    _largest(recording), _growth(recording, facts.noise, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
                     beware(recording, cells), pause_words(supplied(recording).t))
 
 
-def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:
-    """Return the ratio of noise at the highest and lowest throttle, by a fit (rms in V)."""
+def _growth(recording: Recording, noise: Noise, near: Sequence[int]) -> float:
+    """Return the ratio of noise at the highest and lowest throttle flown, by a fit."""
+    # At steady throttle, if that is known, so that responses to its changes do not count.
+    steady = [k for k in near if math.isfinite(noise.steady_rms_v[k])]
+    rms, near = (noise.steady_rms_v, steady) if len(steady) > 2 else (noise.rms_v, near)
     if len(near) < 2 or not min(rms[k] for k in near) > 0.0:
         return 1.0
     u = np.array(THROTTLES)[near]
     weight = np.sqrt([np.count_nonzero(np.abs(recording.throttle - at) <= BAND) for at in u])
-    slope = float(np.polyfit(u, np.log(np.array(rms)[near]), 1, w=weight)[0])
-    return math.exp(slope * float(u[-1] - u[0]))
+    (slope, _), error = np.polyfit(u, np.log(np.array(rms)[near]), 1, w=weight,
+                                   cov=True if len(near) > 2 else 'unscaled')
+    # The scatter about the line shows whether it is a trend; two points have none.
+    seen = len(near) == 2 or abs(slope) > 2.0 * math.sqrt(error[0, 0])
+    return math.exp(float(slope) * float(u[-1] - u[0])) if seen else 1.0
 
 
 def _largest(recording: Recording) -> float:
@@ -268,7 +275,8 @@ def _noise_words(found: Overview) -> str:
         return 'none'
     if first == last:
         return f'{number(1e3 * low)} mV rms'
-    if _GROWS * found.growth > 1.0 and found.growth < _GROWS:
+    ratios = found.growth, high / max(low, _NOTHING)
+    if _GROWS * max(ratios) > 1.0 and min(ratios) < _GROWS:
         rms = found.facts.noise.rms_v[slice(found.flown[0], found.flown[1] + 1)]
         return (f'{number(1e3 * min(rms))} to {number(1e3 * max(rms))} mV rms, without a trend '
                 'over throttle')

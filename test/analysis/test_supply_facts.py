@@ -18,6 +18,7 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.timeline import supplied
 from project import ROOT
 import pytest
+from simulated_packs import flown
 
 RATE = 200.0
 
@@ -356,6 +357,19 @@ def test_one_loud_throttle_is_no_trend(last):
     found = overview(replace(one, voltage=16.0 - SAG * one.throttle ** 1.8 + noise))
     assert 0.8 < found.growth < 1.25
     assert dict(known_lines(found))['Noise'].endswith('without a trend over throttle')
+
+
+@pytest.mark.parametrize('growth, least, most', [(0.0, 0, 3), (2.0, 20, 20)])
+def test_noise_grows_only_beyond_its_scatter(growth, least, most):
+    """20 packs read at 10 Hz, whose steps of throttle leave more residuals at some throttles."""
+    said = 0
+    for seed in range(20):
+        t, v, u = flown(seed, seconds=120.0, noise=0.0)
+        rng = np.random.default_rng(seed + 999)
+        v = v + 0.02 * (1.0 + growth * u) * rng.standard_normal(t.size)
+        found = overview(Recording(t[::5], v[::5], u[::5]))
+        said += 'grows with throttle' in dict(known_lines(found))['Noise']
+    assert least <= said <= most
 
 
 def test_unknown_facts_are_stated_and_the_others_kept():
