@@ -180,7 +180,7 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
 def _numbers(analysis: Analysis) -> list[str]:
     whole, recording = analysis.overview.whole, analysis.recording
     ou = whole or analysis.overview.facts.ou
-    if ou.status != 'ok':
+    if ou.status != 'ok' or analysis.overview.rounding:
         return []
     low, high = ou.alpha_95
     held = recording.throttle[recording.t >= recording.t[-1] - ou.window_s]
