@@ -73,10 +73,11 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         if state.drawn is not None:
             samples, start = _without_clipping(samples, state, start)
         # Name causes from readings drawn within the ADC's codes, but score them on logged codes.
-        inside, start = _within_codes(samples, state, start) if samples.cell else (samples, start)
+        inside, start, loaded = _within_codes(samples, state, start) if samples.cell else (
+            samples, start, None)
         done(0.1)
         named = named_causes(inside, start, rng, state.exact,
-                             lambda share: done(0.1 + 0.5 * share))
+                             lambda share: done(0.1 + 0.5 * share), loaded)
         found = named.found
         model, names = (found.whole, found.search.accepted) if inside is samples else (
             _fit_to_codes(samples, state, found))
@@ -171,23 +172,22 @@ def _without_clipping(samples: Samples, state: Integrity, start: Composite
 
 
 def _within_codes(samples: Samples, state: Integrity, start: Composite
-                  ) -> tuple[Samples, Composite]:
-    """Return the samples drawn within coarse codes, and the start of the search."""
-    rng, inside, model = np.random.default_rng(0), samples, start
+                  ) -> tuple[Samples, Composite, tuple[Fitter, Search] | None]:
+    """Return the samples drawn within coarse codes, the start of the search, and its load."""
+    rng, inside, model, loaded = np.random.default_rng(0), samples, start, None
     for turn in range(_REDRAWN):
         if turn < _SEARCHED:
             # Use the terms of the load that have evidence: readings drawn from a model with all
             # terms would confirm each of them.
-            search = Search(start)
-            under_load(Fitter(inside), search)
-            model = search.composite
+            loaded = under_load(inside, start)
+            model = loaded[1].composite
         else:
             model = Fitter(inside).fit(model.terms, model) or model
         drawn = redraw_within_codes(samples, model, rng)
         if drawn is samples:
             break
-        inside, start = drawn, _start(drawn, state)
-    return inside, start
+        inside, start, loaded = drawn, _start(drawn, state), None
+    return inside, start, loaded
 
 
 def _fit_to_codes(samples: Samples, state: Integrity, found: FittedSearch

@@ -57,19 +57,19 @@ class Named:
 
 
 def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
-                 exact: tuple[Term, ...], progress: Progress) -> Named:
+                 exact: tuple[Term, ...], progress: Progress,
+                 loaded: tuple[Fitter, Search] | None = None) -> Named:
     """Search for causes; withdraw those that do not explain their statistics."""
+    # loaded: result of `under_load`, if known.
     bank = simulate_bank(samples, start, rng)
     before = criticise(samples, start, bank)
-    fitter = Fitter(samples, start.cost)
-    search = Search(fitter.fit(start.terms, start) or start)
-    found = FittedSearch(search.copy(), start, before)
+    found = FittedSearch(Search(start), start, before)
     given = [term.NAME for term in exact]
     failure, begun = '', None
     dropped: list[str] = []
     refuted = -math.inf
     try:
-        under_load(fitter, search)
+        fitter, search = loaded or under_load(samples, start)
         begun = found = _fit_everything(fitter, search, bank)
         for turn in range(_TURNS):
             less = search.copy()

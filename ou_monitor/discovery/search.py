@@ -280,36 +280,35 @@ def _leaves_range(fitter: Fitter, model: Composite) -> bool:
 _SLOW = 1.0
 
 
-def under_load(fitter: Fitter, search: Search) -> None:
+def under_load(samples: Samples, start: Composite) -> tuple[Fitter, Search]:
     """Start from the load model: response to throttle, and noise that follows it, together."""
+    fitter = Fitter(samples, start.cost)
+    plain = fitter.fit(start.terms, start) or start
     # Without throttle, or in a short recording, the starts may be equal.
-    loads = dict.fromkeys(load_terms(fitter.samples, lags) for lags in STARTS)
-    found = [search.copy() for _ in loads]
-    for one, load in zip(found, loads):
-        _from_load(fitter, one, load)
-    best = max(found, key=lambda one: fitter.evidence(one.composite))
-    search.composite, search.accepted, search.rivals = best.composite, best.accepted, best.rivals
+    loads = dict.fromkeys(load_terms(samples, lags) for lags in STARTS)
+    found = [_from_load(fitter, plain, load) for load in loads]
+    return fitter, max(found, key=lambda search: fitter.evidence(search.composite))
 
 
-def _from_load(fitter: Fitter, search: Search, load: Sequence[Term]) -> None:
+def _from_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Search:
     # If the terms were added one by one, each would absorb effects of the others.  Afterwards each
     # must be worth its own penalty.
-    plain = search.composite
+    search = Search(plain)
     noisy = whole_load(fitter, plain, load)
     if noisy is None:
         choose_response(fitter, search, ())
-        return
+        return search
     search.composite = noisy
     choose_response(fitter, search, load)
     if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
         # Throttle does not move the mean: the search tests the noise terms one by one.
         search.composite, search.accepted = plain, []
         choose_response(fitter, search, ())
-        return
+        return search
     means = [term for term in search.composite.terms if decision.is_response(type(term))]
     bare = fitter.fit([*plain.terms, *means], plain)
     if bare is None:
-        return
+        return search
     # Choose the noise terms again for the new mean, each by its own evidence.
     known = [term.NAME for term in plain.terms]
     best = _noise_beside(fitter, bare, on_sigma=True)
@@ -322,6 +321,7 @@ def _from_load(fitter: Fitter, search: Search, load: Sequence[Term]) -> None:
             search.rivals.setdefault(term.NAME, [])
     backward(fitter, search)
     choose_response(fitter, search, ())
+    return search
 
 
 def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Composite | None:

@@ -146,12 +146,10 @@ def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
         value = worth if NOISE.NAME in given else 20.0
         search.composite, search.accepted = Model([], value), ['drift', name]
 
-    monkeypatch.setattr(rules_of_names, 'Fitter', lambda samples, cost: Table({}))
-    monkeypatch.setattr(Table, 'fit', lambda self, terms, known: Model([], 0.0))
     for name in ('simulate_bank', 'criticise'):
         monkeypatch.setattr(rules_of_names, name, lambda *_: {})
-    monkeypatch.setattr(rules_of_names, 'under_load', lambda fitter, search:
-                        search.accepted.append('drift'))
+    monkeypatch.setattr(rules_of_names, 'under_load', lambda samples, start: (
+        Table({}), Search(Model([], 0.0), ['drift'])))
     monkeypatch.setattr(rules_of_names, 'name_causes', add)
     monkeypatch.setattr(rules_of_names, '_fit_everything', lambda fitter, search, bank:
                         rules_of_names.FittedSearch(search.copy(), search.composite, {}))
