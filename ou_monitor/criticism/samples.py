@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 import math
 
 import numpy as np
@@ -89,9 +89,7 @@ class Samples:
 
     def columns(self, term: Term) -> FloatArray:
         """Return the columns of a term of the mean, cached; shorter parts share them."""
-        source = self.longer or self
-        # The columns do not depend on the coefficients of the term.
-        unit = term.with_linear([1.0] * len(term.LINEAR))
+        source, unit = self.longer or self, unit_of(term)
         if unit not in source._known:
             source._known[unit] = unit.columns(source.segment(1.0, 0.0))
         return source._known[unit][:self.n]
@@ -145,6 +143,12 @@ class Samples:
             origin=float(self.t[0]), alpha=np.full(n, alpha), sigma=np.full(n, sigma),
             power=np.ones(n), push=np.zeros(n), bend=(0.0, 0.0), x=np.zeros(n),
             level=np.zeros(n), noise=np.ones(n), voltage=np.zeros(n))
+
+
+@lru_cache(maxsize=1000)
+def unit_of(term: Term) -> Term:
+    """Return a term of the mean with coefficients of 1, on which its columns do not depend."""
+    return term.with_linear([1.0] * len(term.LINEAR))
 
 
 def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:

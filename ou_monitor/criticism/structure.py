@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.samples import Samples, unit_of
 from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import JitterOnLines
@@ -408,7 +408,7 @@ def coefficients(term: Term) -> list[float]:
 def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
     """Return voltage and columns of the mean, as the instrument shows them; cached by terms."""
     means = _means(terms)
-    key = tuple(term.with_linear([1.0] * len(term.LINEAR)) for term in means)
+    key = tuple(map(unit_of, means))
     if key not in samples.designs:
         samples.designs.clear()
         samples.designs[key] = np.concatenate([
