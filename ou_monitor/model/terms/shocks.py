@@ -475,9 +475,8 @@ class Volatility(Term):
         trained = view.train.stop // size
 
         def values(points: FloatArray) -> FloatArray:
-            inside = np.clip(points, *_RANGE)
-            return np.asarray(_grid(squares[:trained], sizes[:trained], span, inside)[1].sum(
-                axis=0))
+            return _log_likelihood(
+                squares[:trained], sizes[:trained], span, np.clip(points, *_RANGE))
 
         def value(x: FloatArray) -> float:
             return float(values(x[None])[0])
@@ -489,7 +488,7 @@ class Volatility(Term):
             x, _ = climb(value, start, size=0.25, most=_EVALUATIONS[known])
             e = curvature_se(value, x)
         x = np.clip(x, *_RANGE)
-        before, density, levels = (one[..., 0] for one in _grid(squares, sizes, span, x[None]))
+        before, density, levels = _grid(squares, sizes, span, x)
         scores = _scores(view.z, before, levels, size)[:view.z.size]
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
         term = cls(math.exp(x[0]), math.exp(x[1]))
@@ -589,26 +588,59 @@ def _kernels(keep: FloatArray) -> FloatArray:
     return chances
 
 
-def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
-          ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return for each point: prior of levels and log density in each segment, and the levels."""
-    reach = math.sqrt(_LEVELS - 1.0)
-    std = np.exp(points[:, :1])
-    levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
-    rates, which = np.unique(points[:, 1], return_inverse=True)
-    kernel = _kernels(np.exp(-np.exp(rates) * span))[which]
-    weight = -0.5 * squares[:, None, None] * np.exp(-2.0 * levels)
-    weight -= sizes[:, None, None] * levels
-    top = weight.max(axis=2)
-    weight -= top[:, :, None]
-    np.exp(weight, out=weight)
-    before = np.empty_like(weight)
-    law = np.tile(_STATIONARY, (points.shape[0], 1))
-    for k, row in enumerate(weight):
-        before[k] = law
-        law = ((law * row)[:, None] @ kernel)[:, 0]
+def _log_likelihood(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
+                    ) -> FloatArray:
+    """Return the log density of all segments for each point."""
+    # Many points share a rate, or the levels: compute all combinations of rates and levels.
+    rates, row = np.unique(points[:, 1], return_inverse=True)
+    places, column = np.unique(points[:, ::2], axis=0, return_inverse=True)
+    if squares.size % 2 == 0:
+        # A last segment without samples changes nothing.
+        squares, sizes = np.append(squares, 0.0), np.append(sizes, 0.0)
+    weight, top = _weights(squares, sizes, _levels(places[:, :1], places[:, 1:]))
+    # The chain is reversible: compute its second half, backwards in time, beside its first half.
+    half, kernels = squares.size // 2, _kernels(np.exp(-np.exp(rates) * span))
+    both = np.concatenate((weight[:half], weight[:half:-1]), axis=1)
+    law = np.tile(_STATIONARY, (rates.size, both.shape[1], 1))
+    found = np.zeros((rates.size, 2, places.shape[0]))
+    for k, factor in enumerate(both):
+        law = (law * factor) @ kernels
         if k % _EVERY == 0:
-            law /= law.sum(axis=1, keepdims=True)
-    before /= before.sum(axis=2, keepdims=True)
-    density = np.log(np.einsum('kpl,kpl->kp', before, weight)) + top
-    return before.transpose(0, 2, 1), density, levels.T
+            scale = law.sum(axis=2, keepdims=True)
+            law /= scale
+            found += np.log(scale).reshape(found.shape)
+    first, last = np.split(law, 2, axis=1)
+    middle = (first * last * weight[half] / _STATIONARY).sum(axis=2)
+    total: FloatArray = found.sum(axis=1) + np.log(middle) + top.sum(axis=0)
+    return total[row, column.ravel()]
+
+
+def _levels(std: FloatArray | float, mean: FloatArray | float) -> FloatArray:
+    """Return the levels of ln sigma, from ln of their standard deviation and their mean."""
+    reach = math.sqrt(_LEVELS - 1.0)
+    return np.asarray(mean + np.exp(std) * np.linspace(-reach, reach, _LEVELS))
+
+
+def _weights(squares: FloatArray, sizes: FloatArray, levels: FloatArray
+             ) -> tuple[FloatArray, FloatArray]:
+    """Return the density of each segment at each level, the largest scaled to 1, and its log."""
+    weight = np.multiply.outer(-0.5 * squares, np.exp(-2.0 * levels))
+    weight -= np.multiply.outer(sizes, levels)
+    top = weight.max(axis=-1)
+    weight -= top[..., None]
+    return np.exp(weight, out=weight), top
+
+
+def _grid(squares: FloatArray, sizes: FloatArray, span: float, x: FloatArray
+          ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return prior of levels and log density in each segment, and the levels."""
+    levels, (kernel,) = _levels(x[0], x[2]), _kernels(np.exp(-np.exp(x[1:2]) * span))
+    weight, top = _weights(squares, sizes, levels)
+    before, law = np.empty_like(weight), _STATIONARY
+    for k, factor in enumerate(weight):
+        before[k] = law
+        law = (law * factor) @ kernel
+        if k % _EVERY == 0:
+            law /= law.sum()
+    before /= before.sum(axis=1, keepdims=True)
+    return before, np.log(np.einsum('kl,kl->k', before, weight)) + top, levels
