@@ -37,7 +37,7 @@ _FEWEST, _SHORTEST = 64, 64
 # Relative difference up to which steps count as equal.
 ALIKE = 0.3
 # Minimum measurement noise, as a share of the variance of a step: keeps the filter nonsingular.
-_NO_NOISE = 1e-6
+NO_NOISE = 1e-6
 
 
 def steps_before(t: FloatArray) -> FloatArray:
@@ -58,7 +58,7 @@ def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: flo
     dt = steps_before(t)[1:]
     q = np.append(var_inf, -var_inf * np.expm1(-2.0 * alpha * dt))
     f = np.append(0.0, np.exp(-alpha * dt))
-    r = np.full(t.size, max(noise_var, _NO_NOISE * float(q.min())))
+    r = np.full(t.size, max(noise_var, NO_NOISE * float(q.min())))
     run = Filter(StateSpace(f[:, None, None], q[:, None, None], np.ones(1), r))
     return np.asarray(run.innovations(deviation) / np.sqrt(run.variance))
 

@@ -279,15 +279,12 @@ class NullBank:
     mean: dict[str, float]
     std: dict[str, float]
 
-    def standardised(self, values: dict[str, float]) -> dict[str, float]:
-        """Return statistics scaled to be N(0, 1) under the baseline."""
-        return {name: (value - self.mean.get(name, 0.0)) / self.std.get(name, 1.0)
-                for name, value in values.items()}
-
 
 def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[str, float]:
     """Return the statistics of a model, scaled to be N(0, 1) if it is right."""
-    return bank.standardised(statistics(composite.z, covariates_of(samples, composite)))
+    values = statistics(composite.z, covariates_of(samples, composite))
+    return {name: (value - bank.mean.get(name, 0.0)) / bank.std.get(name, 1.0)
+            for name, value in values.items()}
 
 
 def simulate_bank(samples: Samples, composite: Composite, rng: np.random.Generator) -> NullBank:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
+from ou_monitor.criticism.innovations import NO_NOISE
 from ou_monitor.criticism.samples import Samples, unit_of
 from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.terms.ou import OU
@@ -23,8 +24,6 @@ from ou_monitor.model.terms.term import Role, Segment, Term
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 
-# Minimum measurement noise, as a share of the variance of a step: keeps the filter nonsingular.
-NO_NOISE = 1e-6
 # Step of the numerical derivatives (scores), in the logarithm of a parameter.
 _STEP = 1e-4
 # Maximum rounds of a full fit, of a rough fit, and of a last fit that begins near the maximum.
@@ -91,12 +90,12 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
         fit, cost = replace(fit, terms=mean.terms), cost + mean.cost
     # A rough fit of many states has no standard errors.
-    whole = evaluate(samples, fit.terms, events, fit.se or tuple({} for _ in fit.terms))
-    return replace(whole, cost=cost + whole.cost)
+    whole = evaluate(samples, fit.terms, events)
+    return replace(whole, se=fit.se or whole.se, cost=cost + whole.cost)
 
 
 def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
-             se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
+             inside: bool = False) -> GaussianFit:
     """Filter with given parameters (inside: variances include the event at each sample)."""
     run = _filter(samples, terms, events)
     beta = [value for term in terms for value in coefficients(term)]
@@ -105,8 +104,8 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     # Exclude the event at each sample, because a law predicts it.  Only the fit of the Gaussian
     # part, which has no laws, includes the event.
     variance = run.full if inside else run.plain
-    return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
-                       run.segment.phi, run.cost)
+    return GaussianFit(tuple(terms), tuple({} for _ in terms), mean, e, variance,
+                       _log_density(e, variance), run.segment.phi, run.cost)
 
 
 def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
@@ -120,8 +119,8 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     design = design_of(samples, (*kept, *more), run.segment)
     voltage = samples.voltage if offset is None else samples.voltage - offset
-    fixed = [] if own else [k for k, term in enumerate(owners(terms))
-                            if term is not None and not term.MEASURED]
+    owners = [term for term in _means(terms) for _ in term.LINEAR]
+    fixed = [] if own else [k for k, term in enumerate(owners, 1) if not term.MEASURED]
     if fixed:
         beta = np.array([value for term in terms for value in coefficients(term)])
         voltage = voltage - design_of(samples, terms, run.segment)[:, 1:][:, fixed] @ beta[fixed]
@@ -347,7 +346,8 @@ def slopes_of(samples: Samples, terms: Sequence[Term], events: Events | None, ba
     v, cost = base.variance, 0.0
     means, spreads = np.empty((2, samples.n, len(free)))
     for j, (k, name) in enumerate(free):
-        moved, step = _stepped(terms[k], name)
+        step = _STEP if within_range(terms[k], name, _STEP) != terms[k] else -_STEP
+        moved = within_range(terms[k], name, step)
         there = evaluate(samples, (*terms[:k], moved, *terms[k + 1:]), events, inside=True)
         cost += there.cost
         means[:, j] = (there.innovation - base.innovation) / (step * np.sqrt(v))
@@ -355,16 +355,12 @@ def slopes_of(samples: Samples, terms: Sequence[Term], events: Events | None, ba
     return means, spreads, cost
 
 
-def _stepped(term: Term, name: str) -> tuple[Term, float]:
-    """Return a term with a parameter moved by a small step within its range, and the step."""
-    for step in (_STEP, -_STEP):
-        try:
-            moved = term.moved(name, step)
-        except ValueError:
-            continue
-        if moved != term:
-            return moved, step
-    return term, _STEP
+def within_range(term: Term, name: str, by: float) -> Term:
+    """Return a term with a parameter moved, or unchanged if that leaves its range."""
+    try:
+        return term.moved(name, by)
+    except ValueError:
+        return term
 
 
 def gradients(base: GaussianFit, means: FloatArray, spreads: FloatArray) -> FloatArray:
@@ -425,11 +421,6 @@ def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray
 
 def _means(terms: Sequence[Term]) -> tuple[Term, ...]:
     return tuple(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou')
-
-
-def owners(terms: Sequence[Term]) -> list[Term | None]:
-    """Return the term of each column of the mean; None for the level."""
-    return [None, *(term for term in _means(terms) for _ in term.LINEAR)]
 
 
 def solved(gram: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -14,13 +14,13 @@ from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.score_statistics import criticise, family_chance, family_edge
+from ou_monitor.criticism.structure import within_range
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, LoadFall, LowDips, Verdict
 from ou_monitor.discovery.fitting import (
     COLLINEAR, Fitter, follows_time, standard_errors, with_reach)
 from ou_monitor.discovery.gain import (
-    covered, gain_of, growth_of, guess, held_out, HeldOut, mean_score, shrink_of, why_unknown,
-    without)
+    covered, gain_of, growth_of, guess, held_out, mean_score, shrink_of, why_unknown, without)
 from ou_monitor.discovery.load_effects import load_fall, low_dips
 from ou_monitor.discovery.named import (
     FittedSearch, Named, named_causes, prune_by_gain, Pruned, refusal)
@@ -81,7 +81,9 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         found = named.found
         model, names = (found.whole, found.search.accepted) if inside is samples else (
             _fit_to_codes(samples, state, found))
-        plain = _plain_model(samples)
+        alone = _refitted(samples, [guess(samples)])
+        assert alone is not None
+        plain = held_out(samples, alone)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
             raise
@@ -102,7 +104,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         after = after if less is None else criticise(inside, less, named.bank)
     dropped = (*named.dropped, *left.out, *(name for name in accepted if name not in names))
     se = tuple(with_reach(term, found, samples) for term, found in zip(
-        whole.terms, standard_errors(samples, whole, slice(0, samples.n)), strict=True))
+        whole.terms, standard_errors(samples, whole), strict=True))
     done(0.95)
     load = 'current' if math.isfinite(state.full) else 'throttle'
     causes = tuple(replace(cause, explanation=by_load(cause.explanation, load)) for cause in
@@ -211,12 +213,6 @@ def _fit_to_codes(samples: Samples, state: Integrity, found: FittedSearch
 def _refitted(samples: Samples, terms: Sequence[Term]) -> Composite | None:
     """Return terms fitted to everything; None if a law cannot be fitted."""
     return fit_composite(samples, terms, slice(0, samples.n))
-
-
-def _plain_model(samples: Samples) -> HeldOut:
-    plain = _refitted(samples, [guess(samples)])
-    assert plain is not None
-    return held_out(samples, plain)
 
 
 def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str, Any], ...],
@@ -338,11 +334,4 @@ def _at_ends(term: Term, duration: float, step: float) -> list[str]:
     if isinstance(term, LoadTransient) and not term.delay:
         return [] if SHORTEST * step < term.tau < 0.25 * duration else ['tau']
     return [name for name in term.free()
-            if not (_moves(term, name, _STEP) and _moves(term, name, -_STEP))]
-
-
-def _moves(term: Term, name: str, by: float) -> bool:
-    try:
-        return term.moved(name, by) != term
-    except ValueError:
-        return False
+            if any(within_range(term, name, by) == term for by in (-_STEP, _STEP))]

@@ -359,10 +359,10 @@ def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
     return all_moved(starts, free, x), gain
 
 
-def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[dict[str, Any], ...]:
+def standard_errors(samples: Samples, model: Composite) -> tuple[dict[str, Any], ...]:
     """Return standard errors by parameter, one dict per term."""
     found = [_gathered(term, se) for term, se in zip(model.terms, model.se)]
-    for k, more in _mean_errors(samples, model, part).items():
+    for k, more in _mean_errors(samples, model).items():
         found[k] = {**more, **found[k]}
     return tuple(found)
 
@@ -405,7 +405,7 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
     return gathered
 
 
-def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
+def _mean_errors(samples: Samples, model: Composite) -> dict[int, dict[str, Any]]:
     """Return errors of the level, and of coefficients and lags of the mean, by term index."""
     terms = model.gaussian.terms
     where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
@@ -414,7 +414,7 @@ def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, d
     moved = [replace(term, tau=term.tau * math.exp(by)) for term in lags.values()
              for by in (_STEP, -_STEP)]
     try:
-        columns = whitened(samples, terms, moved, own=True)[part, 1:]
+        columns = whitened(samples, terms, moved, own=True)[:, 1:]
     except (ValueError, ArithmeticError):
         # Without its events, the filter of the model is singular.
         return {k: dict.fromkeys(terms[k].LINEAR, math.inf) for k, _ in where}

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import (
-    evaluate, Events, GaussianFit, gradients, slopes_of, solved, whitened, with_mean)
+    evaluate, Events, GaussianFit, gradients, slopes_of, solved, whitened, with_mean, within_range)
 from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
@@ -61,13 +61,13 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
             ) -> Composite | None:
     """Return the model fitted to everything without some of its terms; None if that fails."""
     # A fit worse than `plain` has not converged, and is repeated from another start.
-    kept = _complete(term for k, term in enumerate(model.terms) if k not in indices)
+    kept = complete(term for k, term in enumerate(model.terms) if k not in indices)
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
     known = None if laws else model
     found = [_fitted(samples, kept, known)]
     # A model with further states may be fitted to only a part of the samples, and effects that the
     # `ou` must now explain may be missing in that part.  So also fit all samples, without states.
-    light = _complete(term for term in kept if term.ROLE is not Role.BLOCK)
+    light = complete(term for term in kept if term.ROLE is not Role.BLOCK)
     if len(light) < len(kept):
         found.append(_fitted(samples, light, known))
     if plain is None or not any(fit is not None and float(fit.density.sum()) >= float(
@@ -78,7 +78,7 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
                key=lambda fit: float(fit.density.sum()))
 
 
-def _complete(terms: Iterable[Term]) -> list[Term]:
+def complete(terms: Iterable[Term]) -> list[Term]:
     """Return terms without the modifiers of terms that are missing."""
     kept = list(terms)
     names = {term.NAME for term in kept}
@@ -252,10 +252,7 @@ def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: Floa
     """Return terms with parameters moved, but not beyond their ranges."""
     found = list(terms)
     for (k, name), by in zip(free, step.tolist(), strict=True):
-        try:
-            found[k] = found[k].moved(name, by)
-        except ValueError:
-            continue
+        found[k] = within_range(found[k], name, by)
     return tuple(found)
 
 

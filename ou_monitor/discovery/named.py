@@ -10,7 +10,7 @@ account for its effect.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
@@ -79,7 +79,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
             if fitter.evidence(search.composite) < refuted:
                 # These causes are worse than the withdrawn ones that they replace.
-                search = replace(less, stopped=search.stopped)
+                search = less
             found = _fit_everything(fitter, search, bank)
             out = _withdrawn(fitter, found, begun)
             if not out:
@@ -102,7 +102,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         found = _fit_everything(fitter, search, bank)
     return Named(found, bank, tuple(name for name in dict.fromkeys(dropped)
                                     if name not in found.search.accepted),
-                 before, failure or (STOPPED if search.stopped else ''))
+                 before, failure or (STOPPED if fitter.cost > decision.MOST_COST else ''))
 
 
 def _fit_everything(fitter: Fitter, search: Search, bank: NullBank) -> FittedSearch:
@@ -175,7 +175,7 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
 def _undetermined(samples: Samples, state: Pruned) -> list[int]:
     """Return causes whose amplitudes are all undetermined, unless another cause needs them."""
     model, found = state.full.model, []
-    errors = standard_errors(samples, model, slice(0, samples.n))
+    errors = standard_errors(samples, model)
     for k, worth in enumerate(state.worth):
         at = position(model, state.names, k)
         term = model.terms[at]

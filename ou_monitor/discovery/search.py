@@ -21,7 +21,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.score_statistics import criticise, NullBank
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
-from ou_monitor.discovery.gain import BLOCKS
+from ou_monitor.discovery.gain import BLOCKS, complete
 from ou_monitor.discovery.regression import load_terms, mean_response, STARTS
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
@@ -61,7 +61,6 @@ class Search:
     rivals: dict[str, list[str]] = field(default_factory=dict)
     # For each latent cause, the statistics before it was accepted.
     before_accepted: dict[str, Mapping[str, float]] = field(default_factory=dict)
-    stopped: bool = False  # Whether the search ended because it took too long
 
     def copy(self) -> Search:
         """Return an independent copy of the search."""
@@ -103,7 +102,6 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         backward(fitter, search)
         if best.name not in search.accepted:
             removed.append(best.name)
-    search.stopped = fitter.cost > decision.MOST_COST
 
 
 def backward(fitter: Fitter, search: Search) -> None:
@@ -257,10 +255,8 @@ def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | Non
     """Return the fit without the last term of a name and the terms that modify it."""
     terms = list(composite.terms)
     del terms[max(k for k, term in enumerate(terms) if term.NAME == name)]
-    kinds = {type(term) for term in terms}
-    terms = [term for term in terms if term.CHANGES is None or term.CHANGES in kinds]
     law = catalogue()[name].ROLE is Role.LAW
-    return fitter.fit(terms, None if law else composite, rough=True)
+    return fitter.fit(complete(terms), None if law else composite, rough=True)
 
 
 def _refit(fitter: Fitter, found: Composite) -> Composite:

@@ -48,7 +48,7 @@ def test_a_rough_fit_of_many_states_has_no_errors_and_says_so_of_each_term():
     samples = Samples(t, SupplyModel(terms).simulate(t, np.random.default_rng(3)), None)
     fit = fit_composite(samples, terms, slice(0, samples.n), rough=True, begun=True)
     assert fit.se == ({}, {})
-    found = standard_errors(samples, fit, slice(0, samples.n))
+    found = standard_errors(samples, fit)
     assert len(found) == 2 and found[0]['u0'] > 0.0
 
 

@@ -104,7 +104,7 @@ def test_errors_of_the_mean_are_its_scatter():
         samples = simulated(seed, 2000, 0.4)
         model = fit_composite(samples, [OU(63.0, 0.3, 5.0), LoadSag(0.4, 0.01)],
                               slice(0, samples.n))
-        se = standard_errors(samples, model, slice(0, samples.n))
+        se = standard_errors(samples, model)
         found.append([model.terms[0].u0, model.terms[1].linear, model.terms[1].square])
         stated.append([se[0]['u0'], se[1]['linear'], se[1]['square']])
         assert {'alpha', 'sigma'} <= set(se[0])
