@@ -56,10 +56,9 @@ class Composite:
 
 
 def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: slice,
-                  known: Composite | None = None, *, whole_mean: bool = False,
-                  rough: bool = False, begun: bool = False, first: LawFitter | None = None
-                  ) -> Composite | None:
-    """Fit a model on a part; None if a law cannot be fitted."""
+                  known: Composite | None = None, *, rough: bool = False, begun: bool = False,
+                  first: LawFitter | None = None) -> Composite | None:
+    """Fit a model on a part, its mean on everything; None if a law cannot be fitted."""
     # A law that has no parameters yet is given as its class, and fitted by `first`.  The fit
     # starts from the events and offset of `known`; with the same laws, there is one round only.
     structural = [term for term in terms
@@ -71,8 +70,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
     cost = 0.0
     last = 0 if known is not None and _kinds(known.terms) == _kinds(terms) else _ROUNDS
     for turn in range(1 + last):
-        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean, rough,
-                                begun)
+        gaussian = fit_gaussian(samples, structural, part, events, offset, rough, begun)
         z, density, cost = gaussian.z, gaussian.density, cost + gaussian.cost
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)

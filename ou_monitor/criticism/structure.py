@@ -77,16 +77,15 @@ class GaussianFit:
 
 def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
                  events: Events | None = None, offset: FloatArray | None = None,
-                 whole_mean: bool = False, rough: bool = False, begun: bool = False
-                 ) -> GaussianFit:
-    """Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V)."""
+                 rough: bool = False, begun: bool = False) -> GaussianFit:
+    """Fit the Gaussian part by maximum likelihood on a part, its mean on everything (V)."""
     # begun: whether the parameters were already fitted to the whole part.
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
     fit = _maximise(chosen, tuple(terms), inside, rough, begun=begun)
     cost = fit.cost
-    if whole_mean and chosen.n < samples.n:
+    if chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
         fit, cost = replace(fit, terms=mean.terms), cost + mean.cost
     # A rough fit of many states has no standard errors.

@@ -84,14 +84,16 @@ class Fitter:
     def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
             rough: bool = False, begun: bool = False) -> Composite | None:
         """Return a fit to the first part, its mean fitted to everything; None if it fails."""
-        found = self._fit(terms, self.samples.train, known, whole_mean=True, rough=rough,
-                          begun=begun, first=self.law_fit)
-        return found if found is None or rough else self._fit_apart(found, self.samples.train)
+        part = self.samples.train
+        found = self._fit(terms, part, known, rough, begun)
+        return found if found is None or rough else self._fit_apart(found, part)
 
-    def _fit(self, *model: Any, **options: Any) -> Composite | None:
+    def _fit(self, terms: Sequence[Term | type[Term]], part: slice, known: Composite | None,
+             rough: bool = False, begun: bool = False) -> Composite | None:
         """Run `fit_composite` and count its cost; None if it fails."""
         try:
-            found = fit_composite(self.samples, *model, **options)
+            found = fit_composite(self.samples, terms, part, known, rough=rough, begun=begun,
+                                  first=self.law_fit)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             # Parameters out of range, or an overflow.
             return None
@@ -105,7 +107,7 @@ class Fitter:
                 break
             view = view_of(self.samples, found.gaussian, found.z, part)
             terms = [term.apart(view) if term.APART else term for term in found.terms]
-            again = self._fit(terms, part, found, whole_mean=True, rough=True)
+            again = self._fit(terms, part, found, rough=True)
             if again is None or not self.evidence(again) > self.evidence(found) + _ALIKE:
                 break
             found = again
