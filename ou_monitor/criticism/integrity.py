@@ -52,10 +52,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     report = progress or (lambda share: None)
     notes = list(recording.notes)
     t, v, u = usable(recording, notes)
-    if v.size < LEAST:
-        return Integrity(None, (), tuple(notes), f'It holds {counted(v.size, "usable sample")}; '
-                         f'at least {LEAST} are needed.')
-    reason = why_no_model(v)
+    reason = why_no_model(v) if v.size >= LEAST else (
+        f'It holds {counted(v.size, "usable sample")}; at least {LEAST} are needed.')
     if reason:
         return Integrity(None, (), tuple(notes), reason)
     report(0.2)

@@ -99,14 +99,11 @@ def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
             m = b - a
             mean = float(power[a:b].mean())
             value = (mean ** (1.0 / 3.0) - 1.0 + 1.0 / (9.0 * m)) * 3.0 * math.sqrt(m)
-            yield f'band {k}, {_hertz(a, n, given)} to {_hertz(b, n, given)} Hz', value
+            low, high = max(a, 1) * given.rate / n, b * given.rate / n
+            yield f'band {k}, {low:.3g} to {high:.3g} Hz', value
     # The largest of many exponentials.  The spectrum is flat under the null hypothesis of the
     # bank; `find_lines`, which decides which lines are tried, allows for other spectra.
     yield 'line', _largest(float(power[3:].max()), power.size - 3)
-
-
-def _hertz(bin_: int, n: int, given: Covariates) -> str:
-    return f'{max(bin_, 1) * given.rate / n:.3g}'
 
 
 def _largest(top: float, count: float) -> float:

@@ -121,12 +121,12 @@ class Fitter:
             return model
         return self._fit_apart(again, slice(0, self.samples.n))
 
-    def join(self, composite: Composite, starts: Sequence[Term], rough: bool) -> Composite | None:
-        """Return the fit with more terms, inserted before the laws."""
+    def join(self, composite: Composite, starts: Sequence[Term]) -> Composite | None:
+        """Return a rough fit with more terms, inserted before the laws."""
         structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         structural[0] = starts[-1].beside(structural[0])
-        return self.fit([*structural, *starts, *laws], composite, rough)
+        return self.fit([*structural, *starts, *laws], composite, rough=True)
 
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
@@ -244,7 +244,7 @@ class Fitter:
         changed = [] if kind.CHANGES is None or composite.has(kind.CHANGES.NAME) else list(
             kind.CHANGES.candidates(view))[-1:]
         for start in (*known[:_FULL], *hidden[:_FULL]):
-            found = self.join(composite, [*changed, start], rough=True)
+            found = self.join(composite, [*changed, start])
             if found is not None and _added_term(found).holds(view) and (
                     best is None or self.evidence(found) > self.evidence(best)):
                 best = found

@@ -196,7 +196,7 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     # A line of the scores, with variance 1, gains n rms^2 / 2 nats.
     lines = [Tone.at(line, view) for line in lines_of(view)[:_MOST_LINES]
              if 0.5 * samples.n * line.rms ** 2 > penalty + decision.ACCEPT]
-    fit = fitter.join(composite, lines, rough=True) if lines else None
+    fit = fitter.join(composite, lines) if lines else None
     if fit is None or (fitter.evidence(fit) - fitter.evidence(composite)
                        < decision.ACCEPT * len(lines)):
         return False

@@ -10,7 +10,7 @@ from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.load_response import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
     chain_of, rates_between, RegimeSwitching, relaxing, Scores, stationary_law, step_chances)
-from ou_monitor.model.terms.shocks import _best_runs, _mixture, Jumps
+from ou_monitor.model.terms.shocks import _best_runs, _grid, _log_likelihood, _mixture, Jumps
 from ou_monitor.model.terms.term import curvature_se, normal_scores, refine, View
 from ou_monitor.model.terms.tones import order_power
 import pytest
@@ -150,6 +150,17 @@ def test_best_runs_are_the_best_of_all_choices(seed):
     for k in best:
         expected[begin[k]:end[k]] = True
     assert _best_runs(begin, end, gain, 30).tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize('count', [1, 40, 41])
+def test_volatility_from_both_ends_is_as_likely_as_from_the_beginning(count):
+    """The densities of the filter, summed; points that share a rate or the levels, or neither."""
+    rng = np.random.default_rng(count)
+    squares = np.exp(rng.standard_normal(count)) * rng.chisquare(4, count)
+    sizes = np.full(count, 4.0)
+    points = np.array([[-1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.2, 1.0, 0.3], [0.2, 0.0, 0.3]])
+    alone = [_grid(squares, sizes, 0.1, x)[1].sum() for x in points]
+    assert _log_likelihood(squares, sizes, 0.1, points) == pytest.approx(alone, abs=1e-9)
 
 
 @pytest.mark.parametrize('start', [(0.0, 0.0), (0.9, -1.6), (0.4, -1.0)])
