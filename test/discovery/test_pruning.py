@@ -73,7 +73,7 @@ def run(monkeypatch, values, names, vague=()):
     ('drift', {'rate': 9.0}, False)])
 def test_a_cause_of_undetermined_size_is_left_out(name, errors, vague, monkeypatch):
     """Its size has an error beyond the largest; others stay."""
-    monkeypatch.setattr(pruning, 'standard_errors', lambda samples, model, part: [
+    monkeypatch.setattr(pruning, 'standard_errors', lambda samples, model: [
         {}, {'std': 0.001}, errors])
     state = state_of('measurement_noise', name)
     assert pruning._undetermined(SimpleNamespace(n=9), state) == [1] * vague
