@@ -140,7 +140,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
         full=state.full, has_throttle=recording.has_throttle, seed=seed)
     return replace(finding, words=verdict_words(
-        finding, why, named.dropped, uncovered, against))
+        finding, why, tuple(named.dropped), uncovered, against))
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
@@ -267,7 +267,7 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     notes = [named.failure] if named.failure else []
     for name in dict.fromkeys(dropped):
         one = f"A further '{name}'" if model.has(name) else f"'{name}'"
-        notes.append(f'{one} was fitted, but did not explain its statistics: withdrawn.'
+        notes.append(f'{one} was fitted, but {named.dropped[name]}: withdrawn.'
                      if name in named.dropped else
                      f'{one} was fitted, but did not improve predictions of held-out samples, '
                      'or its size is not determined: left out.')

@@ -1,10 +1,10 @@
 """
 Named causes: accepted by a search, not refuted by a second criticism, and of use to predictions.
 
-The model is criticised on the whole recording; causes that do not explain their statistics are
-withdrawn, and the search continues without them.  Then a cause is removed if the rest, refitted,
-predicts held-out blocks equally well; the others are tested again, because one of them may now
-account for its effect.
+The model is criticised on the whole recording; causes that do not explain their statistics, or
+whose simulations leave the recorded range, are withdrawn, and the search continues without them.
+Then a cause is removed if the rest, refitted, predicts held-out blocks equally well; the others
+are tested again, because one of them may now account for its effect.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ STOPPED = ('The search for causes was cut short because the next ones would have
            'there may be more.')
 
 
+# Why a cause was withdrawn.
+REFUTED = 'did not explain its statistics'
+STRAYS = 'its simulations leave the recorded range'
+
+
 @dataclass(frozen=True)
 class FittedSearch:
     """A search, its model fitted to everything, and the statistics of that model."""
@@ -51,7 +56,7 @@ class Named:
 
     found: FittedSearch
     bank: NullBank  # Calibration of the statistics
-    dropped: tuple[str, ...]  # Causes that were withdrawn
+    dropped: Mapping[str, str]  # Causes that were withdrawn, and why, in words
     before: Mapping[str, float]  # Statistics of the plain model
     failure: str  # Why the search ended early; otherwise empty
 
@@ -66,7 +71,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     found = FittedSearch(Search(start), start, before)
     given = [term.NAME for term in exact]
     failure, begun = '', None
-    dropped: list[str] = []
+    dropped: dict[str, str] = {}
     refuted = -math.inf
     try:
         fitter, search = loaded or under_load(samples, start)
@@ -81,13 +86,16 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                 # These causes are worse than the withdrawn ones that they replace.
                 search = less
             found = _fit_everything(fitter, search, bank)
-            out = _withdrawn(fitter, found, begun)
+            out, why = _withdrawn(fitter, found, begun), REFUTED
+            if out:
+                refuted = max(refuted, fitter.evidence(search.composite))
+            else:
+                out, why = _straying(fitter, found), STRAYS
             if not out:
                 break
-            dropped += [search.accepted[k] for k in out]
-            refuted = max(refuted, fitter.evidence(search.composite))
+            dropped |= {search.accepted[k]: why for k in out}
             found = begun
-            rest = without_causes(fitter, search, out)
+            rest = without_causes(fitter, search, _with_corrections(search.accepted, out))
             if rest is None:
                 break
             search = rest
@@ -100,8 +108,8 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     if failure and begun is not None:
         # Once the load model has been chosen, any state of the search can be used.
         found = _fit_everything(fitter, search, bank)
-    return Named(found, bank, tuple(name for name in dict.fromkeys(dropped)
-                                    if name not in found.search.accepted),
+    return Named(found, bank, {name: why for name, why in dropped.items()
+                               if name not in found.search.accepted},
                  before, failure or (STOPPED if fitter.cost > decision.MOST_COST else ''))
 
 
@@ -123,6 +131,34 @@ def _withdrawn(fitter: Fitter, found: FittedSearch, begun: FittedSearch) -> list
                    # Causes with states of their own that no longer fit their name.
                    *(k for k, kind in enumerate(kinds) if kind.ROLE is Role.BLOCK
                      and not found.whole.terms[position(found.whole, names, k)].holds(view))})
+
+
+def _with_corrections(accepted: Sequence[str], out: Sequence[int]) -> list[int]:
+    """Return withdrawn causes, and those accepted later that may only have corrected them."""
+    kinds = [catalogue()[name] for name in accepted]
+    return [k for k in range(len(kinds)) if k in out or any(
+        j < k and decision.imitate(kinds[k], kinds[j]) for j in out)]
+
+
+def _straying(fitter: Fitter, found: FittedSearch) -> list[int]:
+    """Return the cause, if any, whose removal keeps simulations within the recorded range."""
+    # A term may improve one-step predictions although its simulations exceed the recorded range.
+    # Responses of the mean are not tested, nor combinations of causes.
+    def strays(model: Composite | None) -> bool:
+        try:
+            return model is None or outside_range(fitter.samples, model.terms) > 0.0
+        except ValueError:
+            return True
+
+    if not strays(found.whole):
+        return []
+    best: tuple[float, list[int]] = (-math.inf, [])
+    for k, name in enumerate(found.search.accepted):
+        less = None if decision.is_response(catalogue()[name]) else without_causes(
+            fitter, found.search, [k])
+        if less is not None and not strays(fitter.whole(less.composite)):
+            best = max(best, (fitter.evidence(less.composite), [k]))
+    return best[1]
 
 
 # Minimum number of causes of one kind whose gain is measured together.
@@ -164,11 +200,10 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None and (
             k in vague or not decision.improves_predictions(worth.gain, worth.error, worth.chance)
             and not _absorbs_trend(samples, state, k))]
-        worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
-                 if failing else _cause_of_straying(samples, state))
-        if worst is None or turn == _ROUNDS - 1:
+        if not failing or turn == _ROUNDS - 1:
             break
-        _leave_out(state, worst)
+        _leave_out(state, min(failing, key=lambda k: (
+            -state.worth[k].chance, state.worth[k].gain)))
     return state
 
 
@@ -197,26 +232,6 @@ def _leave_out(state: Pruned, worst: int) -> None:
     state.out += [name for name in dict.fromkeys(state.names)
                   if state.names.count(name) > left.count(name)]
     state.names, state.full = left, less
-
-
-def _cause_of_straying(samples: Samples, state: Pruned) -> int | None:
-    """Return the cause, if any, whose removal keeps simulations within the recorded range."""
-    # A term may improve one-step predictions although its simulations exceed the recorded range.
-    # Responses of the mean are not tested.
-    def far_of(model: Composite) -> float:
-        try:
-            return outside_range(samples, model.terms)
-        except ValueError:
-            return math.inf
-
-    far = far_of(state.full.model)
-    if not far > 0.0:
-        return None
-    other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
-             if worth.less is not None and not decision.is_response(catalogue()[state.names[k]])}
-    # The single cause with the least gain; combinations are not tried.
-    return min((k for k, stays in other.items() if not stays > 0.0), default=None,
-               key=lambda k: state.worth[k].gain)
 
 
 def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:

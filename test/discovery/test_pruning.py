@@ -52,7 +52,6 @@ def run(monkeypatch, values, names, vague=()):
     monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
     monkeypatch.setattr(pruning, '_undetermined', lambda samples, state: [
         k for k, name in enumerate(state.names) if name in vague])
-    monkeypatch.setattr(pruning, '_cause_of_straying', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_absorbs_trend', lambda *given: False)
 
     def measure(samples, state, plain, scored, progress):
@@ -109,28 +108,49 @@ def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, mon
         assert 'errors' in refusal(None, (BASE,), gain, 0.01, larger=True)
 
 
-@pytest.mark.parametrize('full, less, gains, out', [
-    (0.0, (0.0, 0.0), (0.1, 0.2), None), (1.0, (0.0, 1.0), (0.2, 0.1), 0),
-    (1.0, (1.0, 0.0), (0.1, 0.2), 1), (1.0, (0.0, 0.0), (0.2, 0.1), 1),
-    (1.0, (2.0, 0.5), (0.1, 0.2), None)])
-def test_the_cheapest_cause_of_strays_is_found(full, less, gains, out, monkeypatch):
+def straying(monkeypatch, far, *names, evidence=()):
+    """Return which cause is withdrawn (far: how far simulations stray, V, by their terms)."""
+    evidence = dict(zip(names, evidence))
+
+    def left(fitter, search, out):
+        return SimpleNamespace(composite=scored_model(
+            *(name for k, name in enumerate(names) if k not in out)).model)
+
+    monkeypatch.setattr(pruning, 'outside_range', lambda samples, terms: far(
+        [term.NAME for term in terms[1:]]))
+    monkeypatch.setattr(pruning, 'without_causes', left)
+    fitter = SimpleNamespace(samples=None, whole=lambda model: model, evidence=lambda model: sum(
+        evidence.get(term.NAME, 0.0) for term in model.terms))
+    return pruning._straying(fitter, pruning.FittedSearch(
+        SimpleNamespace(accepted=list(names)), scored_model(*names).model, {}))
+
+
+@pytest.mark.parametrize('full, less, evidence, out', [
+    (0.0, (0.0, 0.0), (1.0, 2.0), []), (1.0, (0.0, 1.0), (2.0, 1.0), [0]),
+    (1.0, (1.0, 0.0), (1.0, 2.0), [1]), (1.0, (0.0, 0.0), (2.0, 1.0), [1]),
+    (1.0, (2.0, 0.5), (1.0, 2.0), [])])
+def test_the_cheapest_cause_of_strays_is_found(full, less, evidence, out, monkeypatch):
     """Of those without which they stay within what was seen, the one that costs least."""
-    state = state_of('tone', 'measurement_noise')
-    state.worth = [Worth(gain, 0.01, 0.0, 1, worth.less)
-                   for gain, worth in zip(gains, state.worth)]
-    far = {state.full.model.terms: full,
-           **{worth.less.model.terms: by for worth, by in zip(state.worth, less)}}
-    monkeypatch.setattr(pruning, 'outside_range', lambda samples, terms: far[terms])
-    assert pruning._cause_of_straying(None, state) == out
+    left = {('tone',): less[1], ('measurement_noise',): less[0]}
+    assert straying(monkeypatch, lambda names: left.get(tuple(names), full), 'tone',
+                    'measurement_noise', evidence=evidence) == out
 
 
 def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
     """An answer of the mean is never the one that is left out for it."""
-    def far(samples, terms):
-        if any(term.NAME == 'tone' for term in terms):
+    def far(names):
+        if 'tone' in names:
             raise ValueError('runs away')
         return 0.0
 
-    monkeypatch.setattr(pruning, 'outside_range', far)
-    assert pruning._cause_of_straying(None, state_of('drift', 'tone')) == 1
-    assert pruning._cause_of_straying(None, state_of('drift')) is None
+    assert straying(monkeypatch, far, 'drift', 'tone') == [1]
+    assert straying(monkeypatch, far, 'drift') == []
+    assert straying(monkeypatch, lambda names: 1.0 - len(names), 'drift') == []
+
+
+@pytest.mark.parametrize('accepted, out, gone', [
+    (['drift', 'jumps', 'volatility'], [1], [1, 2]), (['volatility', 'jumps'], [1], [1]),
+    (['jumps', 'tone'], [0], [0]), (['jumps', 'tone', 'heavy_tails'], [0, 1], [0, 1, 2])])
+def test_what_imitates_a_withdrawn_cause_and_came_later_goes_with_it(accepted, out, gone):
+    """It may only have corrected that cause's form; the search then tries it alone."""
+    assert pruning._with_corrections(accepted, out) == gone

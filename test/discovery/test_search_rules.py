@@ -136,11 +136,12 @@ def test_sigma_follows_only_if_all_simulations_stay_in_the_recorded_range(on_sig
     assert rules._leaves_range(fitter, model) is leaves
 
 
-@pytest.mark.parametrize('worth, named', [
-    (15.0, ['drift']), (25.0, ['drift', 'second_relaxation'])])
+@pytest.mark.parametrize('worth, test, named', [
+    (15.0, '_withdrawn', ['drift']), (25.0, '_withdrawn', ['drift', 'second_relaxation']),
+    (15.0, '_straying', ['drift', 'second_relaxation'])])
 def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
-        worth, named, monkeypatch):
-    """It imitates it: the withdrawn one had an evidence of 20 nats."""
+        worth, test, named, monkeypatch):
+    """It imitates it: the refuted one had 20 nats; one that strays says nothing of others."""
     def add(fitter, search, bank, given, **_):
         name = SLOW.NAME if NOISE.NAME in given else NOISE.NAME
         value = worth if NOISE.NAME in given else 20.0
@@ -153,13 +154,14 @@ def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
     monkeypatch.setattr(rules_of_names, 'name_causes', add)
     monkeypatch.setattr(rules_of_names, '_fit_everything', lambda fitter, search, bank:
                         rules_of_names.FittedSearch(search.copy(), search.composite, {}))
-    monkeypatch.setattr(rules_of_names, '_withdrawn', lambda fitter, found, begun: [
-        k for k, name in enumerate(found.search.accepted) if name == NOISE.NAME])
+    for one in ('_withdrawn', '_straying'):
+        monkeypatch.setattr(rules_of_names, one, lambda fitter, found, *_, mine=one == test: [
+            k for k, name in enumerate(found.search.accepted) if mine and name == NOISE.NAME])
     monkeypatch.setattr(rules_of_names, 'without_causes', lambda fitter, search, out: replace(
         search, composite=Model([], 5.0), accepted=['drift']))
     start = Model([BASE], 0.0)
     found = rules_of_names.named_causes(SimpleNamespace(t=np.arange(3.0)), start, None, (), print)
-    assert found.found.search.accepted == named and found.dropped == (NOISE.NAME,)
+    assert found.found.search.accepted == named and [*found.dropped] == [NOISE.NAME]
 
 
 LAWS = {'s': SIGMA, 'n': LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5)),
