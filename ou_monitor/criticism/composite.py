@@ -50,6 +50,10 @@ class Composite:
         return float(self.density.sum() - 0.5 * self.free * math.log(samples.train.stop)
                      - self.search)
 
+    def last(self, kind: type[Term]) -> Term:
+        """Return the last term of a kind."""
+        return [term for term in self.terms if term.NAME == kind.NAME][-1]
+
     def has(self, name: str) -> bool:
         """Return whether the model has a term of that name."""
         return any(term.NAME == name for term in self.terms)
@@ -63,7 +67,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
     # starts from the events and offset of `known`; with the same laws, there is one round only.
     structural = [term for term in terms
                   if isinstance(term, Term) and term.ROLE is not Role.LAW]
-    laws = [term for term in terms if term.ROLE is Role.LAW]
+    laws = sorted((term for term in terms if term.ROLE is Role.LAW),
+                  key=lambda law: not law.EVENTS)
     events = None if known is None else known.events
     offset = None if known is None else known.offset
     fits: list[LawFit] = []
@@ -76,7 +81,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
         power, white = np.ones(samples.n), np.ones(samples.n)
         for k, law in enumerate(laws):
-            view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
+            view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power,
+                           power=1.0 if events is None else events.power)
             fit = (law.refit_law(view) if isinstance(law, Term) else
                    first(law, view) if first else law.fit_law(view))
             if law.SLOW_FIT:

@@ -72,7 +72,7 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
             and (throttle or not kind.NEEDS_THROTTLE)
             and (kind.ROLE is not Role.LAW or kind.CHANGES is None or kind.CHANGES in model)
             and (kind.RECURS or all(other.NAME != kind.NAME for other in model))
-            and not any(imitate(kind, other) for other in model)]
+            and not any(imitate(kind, other) and kind.EVENTS is other.EVENTS for other in model)]
 
 
 def imitate(one: Kind, other: Kind) -> bool:

@@ -166,7 +166,7 @@ class Fitter:
         for kind in kinds:
             # Candidates of a law have its NAME, but another class and ROLE (`clock_jitter`).
             starts = kind.candidates(view) if kind.ROLE is Role.LAW else None
-            if starts == () and not self._finds_events(kind, view):
+            if starts == () and not self._finds_events(kind, composite, view):
                 gain, start = self._law_gain(kind, view), None
             else:
                 start = self.best_start(composite, kind, view, least, starts)
@@ -190,8 +190,7 @@ class Fitter:
                             start or composite)
             if start is not None and (full is None or self.evidence(full) < self.evidence(start)):
                 full = start
-            if full is not None and [term for term in full.terms if term.NAME == kind.NAME][
-                    -1].holds(self.view(composite)):
+            if full is not None and full.last(kind).holds(self.view(composite)):
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
                 found.append(Trial(
                     kind.NAME, full, self.evidence(full) - self.evidence(composite),
@@ -209,8 +208,10 @@ class Fitter:
             self.law_fits[kind] = last
         return last[1]
 
-    def _finds_events(self, kind: type[Term], view: View) -> bool:
+    def _finds_events(self, kind: type[Term], composite: Composite, view: View) -> bool:
         """Return whether a law finds events, which inflate the variances of fits without it."""
+        if _hidden_by_laws(kind, composite):
+            return True
         found = None if kind.SLOW_FIT else self.law_fit(kind, view)
         return found is not None and (found.push is not None or found.error is not None)
 
@@ -228,8 +229,9 @@ class Fitter:
         """Return the best fit with one more term of a kind (starts: its candidates by default)."""
         # least: minimum gain of a BROAD kind in the spectrum, nats.
         if kind.ROLE is Role.LAW and not starts:
-            found = self.fit([*composite.terms, kind], composite, rough=True)
-            return found if found is not None and found.terms[-1].holds(view) else None
+            found = self.fit([*composite.terms, kind],
+                             None if _hidden_by_laws(kind, composite) else composite, rough=True)
+            return found if found is not None and found.last(kind).holds(view) else None
         starts = list(kind.candidates(view)) if starts is None else list(starts)
         if kind.BROAD and not any(term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE
                                   for term in composite.terms):
@@ -290,6 +292,11 @@ def is_trend(samples: Samples, model: Composite) -> bool:
     ou = model.terms[0]
     assert isinstance(ou, OU)
     return not decision.relaxes(ou.alpha, float(samples.t[-1] - samples.t[0]))
+
+
+def _hidden_by_laws(kind: type[Term], composite: Composite) -> bool:
+    """Return whether the laws of a model may have absorbed the events that a kind finds."""
+    return kind.EVENTS and any(term.ROLE is Role.LAW for term in composite.terms)
 
 
 def _added_term(composite: Composite) -> Term:

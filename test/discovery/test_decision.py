@@ -42,6 +42,14 @@ class Law(Cheap):
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis',)
 
 
+class Events(Law):
+    """Single events, which the other law imitates."""
+
+    NAME = 'events'
+    EVENTS = True
+    IMITATES: ClassVar[tuple[str, ...]] = ('law',)
+
+
 class White(Cheap):
     """A noise of the measurement."""
 
@@ -126,6 +134,14 @@ def test_every_kind_of_the_catalogue_is_tried_once():
 def test_kinds_that_do_not_apply_are_not_tried(changes, missing):
     assert missing in tried(first=changes.get('first', False))
     assert missing not in tried(**changes)
+
+
+def test_events_are_tried_beside_a_law_that_imitates_them():
+    """They are taken out first, so that their evidence beside the law is their own."""
+    assert tried([Law], kinds=[Events]) == ['events']
+    assert tried([Events], kinds=[Law]) == ['law']
+    both = [KINDS['jumps'], KINDS['glitches']]
+    assert tried([both[0]], kinds=both) == tried([both[1]], kinds=both) == []
 
 
 @pytest.mark.parametrize('kind, values, nats', [

@@ -6,6 +6,10 @@ from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import discover, read_recording, Recording
 from ou_monitor.criticism.integrity import examine
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.shocks import Glitches, Jumps, Volatility
 from project import ROOT
 import pytest
 
@@ -79,3 +83,16 @@ def test_an_effect_hidden_in_a_flight_is_named_beside_its_sag(effect):
     found = [cause.name for cause in discover(hidden).causes]
     assert right & set(found) and not right & set(own)
     assert 'load_sag' in own and 'load_sag' in found
+
+
+@pytest.mark.parametrize('event', [Jumps(1.0, -0.3, 0.1), Glitches(0.01, 0.3), None])
+def test_events_are_found_beside_a_wandering_sigma(event):
+    """In nine of ten such rails, and no events where there are none."""
+    t = 0.005 * np.arange(3000)
+    events = () if event is None else (event,)
+    rail = SupplyModel((
+        OU(20.0, 0.06, 12.0), MeasurementNoise(0.01), Volatility(0.4, 4.0), *events))
+    right = {term.NAME for term in rail.terms[1:]}
+    found = [{cause.name for cause in discover(Recording(
+        t, rail.simulate(t, np.random.default_rng(seed)))).causes} for seed in range(4)]
+    assert sum(names == right for names in found) >= 3

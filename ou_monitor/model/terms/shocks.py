@@ -35,6 +35,7 @@ class Jumps(Term):
     ROLE = Role.LAW
     SIGNS = ('kurtosis', 'tails', 'skewness')
     IMITATES = 'clock_jitter', 'glitches', 'heavy_tails', 'regime_switching', 'volatility'
+    EVENTS = True
     SEVERAL = True
     MEANING = 'Random jumps of the rail that decay at the rate alpha: load pulses.'
     REMEDY = 'Look for loads that switch at that rate: servos, payload, radio.'
@@ -146,6 +147,7 @@ class Glitches(Term):
     ROLE = Role.LAW
     SIGNS = ('kurtosis', 'tails', 'pairs', 'autocorrelation')
     IMITATES = ('clock_jitter', 'heavy_tails', 'jumps')
+    EVENTS = True
     SEVERAL = True
     MEANING = (
         'Outlying single readings, or a few in a row, without relaxation after them: bus errors, '
@@ -173,7 +175,8 @@ class Glitches(Term):
         # Use errors and variances of a filter without measurement noise, in which a sample affects
         # only its own error and the next.  Take the scale from a median, because bad samples have
         # increased the fitted noise.
-        own = view.variance * (view.driven + (1.0 - view.trust) * (1.0 + view.phi ** 2))
+        own = view.power * view.variance * (
+            view.driven + (1.0 - view.trust) * (1.0 + view.phi ** 2))
         plain = (view.residual - view.phi * view.state) / np.sqrt(own)
         unit = float(np.median(np.abs(plain))) / 0.6745
         scaled = replace(view, z=plain / unit, variance=own * unit * unit)

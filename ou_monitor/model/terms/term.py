@@ -110,6 +110,8 @@ class View:
     # Share of each variance that is due to the noise of the `ou` in the step before: 1 without
     # white noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
+    # Factor on the variance that other laws have found; `variance` excludes it; shape (n,).
+    power: FloatArray | float = 1.0
     slope: FloatArray | float = 0.0  # Slope of the tones of the model, V/s; shape (n,)
     by_current: bool = False  # Whether `throttle` is a current as a share of the largest
 
@@ -299,6 +301,9 @@ class Term:
     # Causes that are hard to distinguish from this one: the search does not add one of such a pair
     # to the other.  It suffices that one of the two classes names the other.
     IMITATES: ClassVar[tuple[str, ...]] = ()
+    # Whether the law finds single events.  It is fitted before the other laws, which would absorb
+    # them, and may be added to one that it imitates.
+    EVENTS: ClassVar[bool] = False
     # Whether a model can have several terms of this class, and whether the search looks for more
     # after it has found one.
     SEVERAL: ClassVar[bool] = False
