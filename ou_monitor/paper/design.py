@@ -219,7 +219,9 @@ def design(
         raise ValueError(f'the minimum capacitance must be below the maximum, got {low:g} F and '
                          f'{high:g} F')
 
-    own = row_of(rail_at(network, throttle, rail), voltage, horizon, sag_error)
+    # The risk of a flight includes the error of the sag, and replaces the one computed here.
+    error = 0.0 if flown is not None else sag_error
+    own = row_of(rail_at(network, throttle, rail), voltage, horizon, error)
 
     def as_flown(row: DesignRow) -> DesignRow:
         if flown is None:
@@ -233,7 +235,7 @@ def design(
 
     def at(capacitance: float) -> DesignRow:
         changed = with_capacitance(network, capacitance, esr_follows)
-        return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error))
+        return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon, error))
 
     rows = [at(float(c)) for c in np.geomspace(low, high, _GRID)]
     least = None
