@@ -38,7 +38,7 @@ from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 from scipy.optimize import brentq
 from scipy.signal import welch
-from scipy.special import betaincinv, chndtrinc, gammaincc, gammaincinv
+from scipy.special import bdtrc, betaincinv, chndtrinc, gammaincc, gammaincinv
 
 # Maximum number of samples in a long piece; limits memory and time.
 _LONGEST = 1 << 20
@@ -79,10 +79,9 @@ def fundamental_of(frequencies: Sequence[float]) -> float:
         order = np.rint(f / trial).astype(np.intp)
         near = (order > 0) & (np.abs(f / trial - order) < _NEAR_MULTIPLE)
         count = np.unique(order[near]).size
-        chance = sum(math.comb(f.size, k) * (2.0 * _NEAR_MULTIPLE)**k
-                     * (1.0 - 2.0 * _NEAR_MULTIPLE)**(f.size - k)
-                     for k in range(count - 1, f.size + 1))
-        if count > most and 3.0 * f.size * chance < _UNRELATED:
+        # bdtrc is the probability of more than that many.
+        if count > most and (3.0 * f.size * bdtrc(count - 2, f.size, 2.0 * _NEAR_MULTIPLE)
+                             < _UNRELATED):
             most = count
             fundamental = float(f[near] @ order[near] / (order[near] @ order[near]))
     return fundamental

@@ -182,6 +182,11 @@ def test_harmonics_have_their_fundamental_and_unrelated_lines_none(count):
     assert false <= 5
 
 
+def test_more_lines_than_a_binomial_coefficient_can_count():
+    """Of 1200 lines it exceeds the largest float."""
+    assert fundamental_of(0.4 * np.arange(1.0, 1201.0)) == pytest.approx(0.4)
+
+
 SIGMA = 0.3
 
 
