@@ -438,11 +438,11 @@ def test_gusts_do_not_hide_the_fall_of_a_throttle_that_is_held():
     A hover in gusts, then 70 % for 2 s: likely 0.3 V above the true lowest, unlikely 0.1 V below.
 
     Throttle within 5 % of the highest counts as its peak, so falls come out too deep by a few per
-    cent of throttle.  When the law could only take that for its gain, the risk was 0.75 to 0.95.
+    cent of throttle.  When the law could only take that for its gain, the risk was 0.63 to 0.91.
     """
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        t = np.arange(0.0, 300.0, 0.02)
+        t = np.arange(0.0, 100.0, 0.02)
         gust = np.interp(t, 0.3 * np.arange(1001), rng.standard_normal(1001))
         u = np.clip(0.45 + 0.06 * gust + 0.03 * rng.standard_normal(t.size), 0.0, 1.0)
         monitor = SupplyMonitor(MonitorSettings(brownout_voltage=12.0))
