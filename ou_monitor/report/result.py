@@ -136,7 +136,15 @@ class Result:
             By title, the main one first.
 
         """
+        return dict(self._drawn)
+
+    @cached_property
+    def _drawn(self) -> dict[str, Plot]:
+        # Kept, because some plots show simulations; not copied with the result.
         return {plot.title: plot for plot in _plots(self.document().parts)}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != '_drawn'}
 
     def plot(self, ax: Axes | None = None, title: str | None = None) -> Axes:
         """
@@ -160,7 +168,7 @@ class Result:
             When there is no such plot, or no matplotlib for a new figure.
 
         """
-        found = self.plots()
+        found = self._drawn
         if not found:
             raise InputError('there is nothing to plot')
         if title is not None and title not in found:
