@@ -9,6 +9,11 @@ from hypothesis import HealthCheck, settings
 import pytest
 
 _ROS = ('nodes/', 'test_package.py', 'test_scripts.py', 'test_readme.py')
+# These read the same recordings, which the support module keeps for the process.
+_READERS = ('online/test_trust.py', 'criticism/test_one_engine.py')
+# Folders whose files take long come first: at the end, both workers have short files.
+_LONG = ('discovery/', 'cli/', 'test_', 'online/', 'criticism/', 'analysis/', 'benchmarks/',
+         'fleet/')
 
 
 # A busy machine generates examples slowly. The same examples in every run;
@@ -25,8 +30,22 @@ def pytest_configure(config):
     # Workers of pytest-xdist use the controller's byte code.
     if not hasattr(config, 'workerinput'):
         compileall.compile_dir(Path(__file__).parents[1] / 'ou_monitor', force=True, quiet=1)
+    # The order of the files is that of the collection, not that of the number of their tests.
+    config.option.loadscopereorder = False
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _file_of(nodeid: str) -> str:
+    return nodeid.split('::', 1)[0].removeprefix('test/')
+
+
+def pytest_collection_modifyitems(items):
+    """Put the files that take long first."""
+    order = [_ROS, *_LONG]
+    items.sort(key=lambda item: next(
+        (k for k, names in enumerate(order) if _file_of(item.nodeid).startswith(names)),
+        len(order)))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -39,8 +58,8 @@ def pytest_xdist_make_scheduler(config, log):
         """Schedules whole files."""
 
         def _split_scope(self, nodeid):
-            path = nodeid.split('::', 1)[0].removeprefix('test/')
-            return 'ros' if path.startswith(_ROS) else path
+            path = _file_of(nodeid)
+            return 'ros' if path.startswith(_ROS) else 'readers' if path in _READERS else path
 
     return ByFile(config, log)
 
