@@ -72,7 +72,12 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
             and (throttle or not kind.NEEDS_THROTTLE)
             and (kind.ROLE is not Role.LAW or kind.CHANGES is None or kind.CHANGES in model)
             and (kind.RECURS or all(other.NAME != kind.NAME for other in model))
-            and not any(imitate(kind, other) and kind.EVENTS is other.EVENTS for other in model)]
+            and not any(imitate(kind, other) and not _apart(kind, other) for other in model)]
+
+
+def _apart(one: Kind, other: Kind) -> bool:
+    """Return whether one of two laws finds events, and the other does not."""
+    return one.ROLE is other.ROLE is Role.LAW and one.EVENTS is not other.EVENTS
 
 
 def imitate(one: Kind, other: Kind) -> bool:

@@ -19,7 +19,6 @@ from ou_monitor.criticism.structure import (
     coefficients, driven, evaluate, state_space, white_noise, whitened)
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.gain import all_moved
-from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
@@ -51,10 +50,15 @@ _FirstEstimate = tuple[float, type[Term], Composite | None]
 class Trial:
     """A candidate, fitted together with the accepted causes."""
 
-    name: str  # Name of the cause
+    kind: type[Term]
     composite: Composite
     evidence: float  # nats
     beside: str = ''  # Name of a cause that it needs and that is added with it; otherwise empty
+
+    @property
+    def name(self) -> str:
+        """Return the name of the cause."""
+        return self.kind.NAME
 
 
 @dataclass(eq=False)
@@ -66,7 +70,7 @@ class Fitter:
     # For each law: the scores to which it was last fitted, and that fit (None: it failed).
     law_fits: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
     # Kinds that were tried without success, with their gain by score tests at that time, nats.
-    failed: dict[str, float] = field(default_factory=dict)
+    failed: dict[type[Term], float] = field(default_factory=dict)
 
     def evidence(self, composite: Composite) -> float:
         """Return the evidence for a model, nats."""
@@ -137,17 +141,17 @@ class Fitter:
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.SLOW_FIT
-                 and shown[kind] > self.failed.get(kind.NAME, -1.0)]
+                 and shown[kind] > self.failed.get(kind, -1.0)]
         estimates = self._first_estimates(composite, tried, 0.0)
         found = self._in_full(composite, estimates, [])
         slow = [kind for kind in kinds if kind.SLOW_FIT and decision.affordable(kind, self.cost)
                 and shown[kind] > self.failed.get(
-                    kind.NAME, decision.TIE if kind.ROLE is Role.LAW else -1.0)]
+                    kind, decision.TIE if kind.ROLE is Role.LAW else -1.0)]
         top = max((estimate[0] for estimate in estimates), default=0.0)
         if slow and found:
             best = max(found, key=lambda trial: trial.evidence)
             left = statistics(best.composite)
-            slow = [kind for kind in slow if decision.imitate(kind, catalogue()[best.name])
+            slow = [kind for kind in slow if decision.imitate(kind, best.kind)
                     or decision.score_gain(kind, left) > decision.TIE]
         if slow:
             estimates += self._first_estimates(composite, slow, _WITHIN * top)
@@ -155,7 +159,7 @@ class Fitter:
             # BROAD kinds below `least` were not estimated in full, so they have not failed.
             tried += [kind for kind in slow if not top or not kind.BROAD]
         gained = {estimate[1] for estimate in estimates}
-        self.failed |= {kind.NAME: shown[kind] for kind in tried if kind not in gained}
+        self.failed |= {kind: shown[kind] for kind in tried if kind not in gained}
         return found
 
     def _first_estimates(self, composite: Composite, kinds: Sequence[type[Term]], least: float
@@ -179,12 +183,12 @@ class Fitter:
     def _in_full(self, composite: Composite, estimates: Sequence[_FirstEstimate],
                  known: list[Trial]) -> list[Trial]:
         """Fit the trials with the best estimates in full, reusing known fits."""
-        found, names = list(known), {trial.name for trial in known}
+        found, done = list(known), {trial.kind for trial in known}
         best = sorted(estimates, key=lambda estimate: -estimate[0])[:_FEW]
         for gain, kind, start in best:
             # A full fit of a law may gain nothing, so compare the estimates with full fits only.
             top = max((trial.evidence for trial in found), default=0.0)
-            if gain < _WITHIN * top or kind.NAME in names:
+            if gain < _WITHIN * top or kind in done:
                 continue
             full = self.fit([*composite.terms, kind] if start is None else start.terms,
                             start or composite)
@@ -193,7 +197,7 @@ class Fitter:
             if full is not None and full.last(kind).holds(self.view(composite)):
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
                 found.append(Trial(
-                    kind.NAME, full, self.evidence(full) - self.evidence(composite),
+                    kind, full, self.evidence(full) - self.evidence(composite),
                     kind.CHANGES.NAME if kind.CHANGES and with_it else ''))
         return found
 

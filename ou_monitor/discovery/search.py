@@ -24,7 +24,7 @@ from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS, complete
 from ou_monitor.discovery.regression import load_terms, mean_response, STARTS
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.catalogue import catalogue, every_kind
 from ou_monitor.model.terms.load_response import (
     LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma, LoadSag)
 from ou_monitor.model.terms.ou import OU
@@ -115,7 +115,7 @@ def without_causes(fitter: Fitter, search: Search, out: Sequence[int]) -> Search
     """Return the search without some of its causes; None if the fit fails."""
     at = {position(search.composite, search.accepted, k) for k in out}
     kept = [term for k, term in enumerate(search.composite.terms) if k not in at]
-    fit = fitter.fit(kept, None)
+    fit = fitter.fit(kept, None) or fitter.fit(kept, search.composite)
     return None if fit is None else replace(search.copy(), composite=fit, accepted=[
         name for k, name in enumerate(search.accepted) if k not in out])
 
@@ -161,7 +161,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
     trials: list[Trial] = []
     for first in (True, False)[:1 + latent]:
         kinds = decision.kinds_to_try(
-            catalogue().values(), [type(term) for term in search.composite.terms], given,
+            every_kind(), [type(term) for term in search.composite.terms], given,
             fitter.samples.throttle is not None, first)
         trials += [trial for trial in fitter.trials(
             search.composite, kinds, lambda model: criticise(fitter.samples, model, bank))

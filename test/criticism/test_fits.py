@@ -18,7 +18,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.regime_switching import RegimeSwitching
+from ou_monitor.model.terms.regime_switching import RegimeSwitching, SwitchingLevels
 from ou_monitor.model.terms.shocks import Volatility
 from ou_monitor.model.terms.slow import ACCoupling, FlickerNoise, SecondRelaxation
 from ou_monitor.model.whittle import Ordinates
@@ -92,7 +92,7 @@ def test_a_simulation_of_switching_has_the_mean_and_dips_of_the_data(level, at_o
     voltage = 11.5 + lfilter([1.0], [1.0, -phi], e) + at_once * moved
     samples, whole = Samples(np.arange(n) / rate, voltage, None), slice(0, n)
     plain = fit_composite(samples, [guess(samples)], whole)
-    found = fit_composite(samples, [plain.terms[0], RegimeSwitching], whole)
+    found = fit_composite(samples, [plain.terms[0], SwitchingLevels], whole)
     switching, se = found.terms[-1], found.se[-1]
     changes = int(np.count_nonzero(np.diff(states)))
     for name, truth in zip(('rate_up', 'rate_down'), rates[::-1 if level < 0.0 else 1]):

@@ -11,7 +11,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import NonlinearRestoring, OU
 from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise
-from ou_monitor.model.terms.regime_switching import RegimeSwitching
+from ou_monitor.model.terms.regime_switching import SwitchingLevels
 from ou_monitor.model.terms.shocks import Glitches
 from ou_monitor.model.terms.term import View
 from ou_monitor.model.terms.tones import order_lines
@@ -98,7 +98,7 @@ def test_switching_between_large_levels_is_found():
     samples = Samples(np.arange(n) / rate, voltage, None)
     plain = fit_gaussian(samples, [OU(60.0, 0.8, 5.0)], samples.train).terms[0]
     assert plain.alpha < 0.3 * alpha
-    simulated = fit_composite(samples, [plain, RegimeSwitching], samples.train)
+    simulated = fit_composite(samples, [plain, SwitchingLevels], samples.train)
     ou, switching = simulated.terms
     # Of 12 s, alpha is known to sqrt(2 / (alpha T)) = 3 %.
     assert ou.alpha == pytest.approx(alpha, rel=0.12)

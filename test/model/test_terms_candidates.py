@@ -9,7 +9,7 @@ from ou_monitor.model.hidden_chain import forward, log_likelihood
 from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.load_response import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import (
-    chain_of, rates_between, RegimeSwitching, relaxing, Scores, stationary_law, step_chances)
+    chain_of, rates_between, relaxing, Scores, stationary_law, step_chances, SwitchingLevels)
 from ou_monitor.model.terms.shocks import _best_runs, _grid, _log_likelihood, _mixture, Jumps
 from ou_monitor.model.terms.term import curvature_se, normal_scores, refine, View
 from ou_monitor.model.terms.tones import order_power
@@ -100,7 +100,7 @@ def flown(levels=0.0, seed=1, n=20_000):
 
 def test_levels_are_found_beside_noise_that_follows_throttle():
     """Levels of three deviations of the calm rail are seen, and about as high as they are."""
-    fit = RegimeSwitching.fit_law(flown(levels=0.1))
+    fit = SwitchingLevels.fit_law(flown(levels=0.1))
     assert abs(fit.term.level) == pytest.approx(0.1, rel=0.15)
     assert fit.term.sigma_ratio == pytest.approx(1.0, abs=0.15)
     assert float(fit.gain.sum()) > 100.0

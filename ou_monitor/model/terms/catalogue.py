@@ -53,6 +53,11 @@ def catalogue() -> Mapping[str, type[Term]]:
     return MappingProxyType(found)
 
 
+def every_kind() -> list[type[Term]]:
+    """Return all terms, each followed by its other forms."""
+    return [form for kind in catalogue().values() for form in (kind, *kind.variants())]
+
+
 def left_out() -> tuple[str, ...]:
     """Return a sentence for each cause of another package that cannot be used."""
     catalogue()

@@ -10,7 +10,7 @@ Autom. Control 33 (1988) 780).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -27,9 +27,7 @@ from scipy.special import ndtr
 
 # Median absolute value of a normal score.
 _MEDIAN = 0.6745
-# Filter gain that counts as 1; level, in standard deviations of an innovation, below which it
-# counts as 0.
-_ALL, NO_LEVEL = 0.98, 0.2
+_ALL = 0.98  # Filter gain that counts as 1
 # Maximum number of times that states and the filter's response to them are computed in turn, and
 # change of the response, in standard deviations of an innovation, at which they agree.
 _TURNS, _SETTLED = 30, 1e-6
@@ -93,7 +91,7 @@ class Scores:
 
     def following(self, x: FloatArray, at_once: float, states: int = 2) -> Scores:
         """Return the scores with `followed` computed for a chain with coordinates x."""
-        if abs(x[2]) < NO_LEVEL or bool((self.trust == 1.0).all()):
+        if x[2] == 0.0 or bool((self.trust == 1.0).all()):
             return self.at_once
         kept, drawn = self.phi * (1.0 - self.trust), self.phi * self.trust
         found = replace(self, followed=np.zeros(self.z.size))
@@ -193,36 +191,56 @@ def _ahead(fit: LawFit, other: LawFit, part: slice) -> float:
     return float((fit.gain - other.gain)[part].sum())
 
 
-def _first_fits(view: View) -> list[Start]:
-    """Return the best short fit with equal levels, and the best with different levels."""
-    best: dict[bool, tuple[float, Start]] = {}
+def _first_fit(view: View, levels: bool) -> Start:
+    """Return the best short fit of a chain of levels, or of sigmas."""
+    best: tuple[float, Start] | None = None
     spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
-    first = slice(0, min(_SHORT, view.train.stop))
-    busy = moving(view, first.stop)
-    for faster in _FASTER:
+    part = moving(view, min(_SHORT, view.train.stop))
+    short, long = (-np.log(_dwells(view))).tolist()
+    # The upper sigma may also be rare.
+    pairs = [(short, short), (long, long), (long, short)][:3 - levels]
+    for faster in _FASTER if levels else _FASTER[:1]:
         relaxed = relaxing(view, faster)
-        scores = Scores.of(relaxed).at_once
+        scores = Scores.of(relaxed).at_once.part(part)
         # If levels hide a faster relaxation, they explain most of the spread.
         height = (1.0 if faster == 1.0 else 2.0) * spread / math.sqrt(
             float(np.median(relaxed.variance)))
-        plain = _densities(view, relaxed)
+        plain = float(_densities(view, relaxed)[part].sum())
+        for up, down in pairs:
+            for at_once in (1.0, 0.0)[:1 + levels]:
+                start = np.array([up, down, height, 0.0, 0.0] if levels else
+                                 [up, down, 0.0, _RATIO, -0.3 * _RATIO])
 
-        def value(x: FloatArray) -> float:
-            if not _is_inside(x, view):
-                return -math.inf
-            chain = chain_of(scores.part(part), x, once)[0]
-            return log_likelihood(*chain) - float(plain[part].sum())
+                def value(x: FloatArray) -> float:
+                    return _value(scores, x, at_once, view)
 
-        for dwell in _dwells(view).tolist():
-            for level, ratio, once in ((0.0, 0.7, 1.0), (height, 0.0, 1.0), (height, 0.0, 0.0)):
-                if level == 0.0 and faster > 1.0:
-                    continue
-                part = busy if level else first
-                rate = -math.log(dwell)
-                x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
-                if (level != 0.0) not in best or top > best[level != 0.0][0]:
-                    best[level != 0.0] = top, Start(x, once, relaxed)
-    return [start for _, start in best.values()]
+                x, top = _climb_form(value, start, 0.4, 40)
+                if best is None or top - plain > best[0]:
+                    best = top - plain, Start(x, at_once, relaxed)
+    assert best is not None
+    return best[1]
+
+
+def _value(s: Scores, x: FloatArray, at_once: float, view: View, states: int = 2,
+           middle: float | None = None) -> float:
+    """Return the log-likelihood of a chain."""
+    if not _is_inside(x, view):
+        return -math.inf
+    return log_likelihood(*chain_of(s, x, at_once, states, middle)[0])
+
+
+def _climb_form(value: Callable[[FloatArray], float], start: FloatArray, size: float, most: int
+                ) -> tuple[FloatArray, float]:
+    """Maximise over the coordinates of a form: a level or a ratio of sigmas of 0 stays 0."""
+    free = (start != 0.0) | np.array([True, True, False, False, True])
+
+    def full(x: FloatArray) -> FloatArray:
+        moved = start.copy()
+        moved[free] = x
+        return moved
+
+    x, top = climb(lambda x: value(full(x)), start[free], size=size, most=most)
+    return full(x), top
 
 
 # Maximum number of events in one segment; limits time and memory.
@@ -238,6 +256,8 @@ _STAYS, _EVEN = 10, 0.35
 class RegimeSwitching(Term):
     """
     Switch between two or three states, `level` apart; `sigma_ratio` multiplies sigma per state.
+
+    A fit finds either: this class finds states of sigma, `SwitchingLevels` finds levels.
 
     The level `u0` of the `ou` is the mean over the states, and its sigma applies to the lowest
     state.  The rate from a state to each higher state is `rate_up`, to each lower state
@@ -339,31 +359,23 @@ class RegimeSwitching(Term):
             f'only {100.0 * least:.0f} %, as with a periodic load')
 
     @classmethod
-    def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a hidden chain of two or three states."""
-        best: tuple[LawFit, Start] | None = None
-        for start in _first_fits(view):
-            fit = cls._best_fit(start.view, [start.x], start.at_once, 80)
-            if fit is None:
-                continue
-            if start.view is not view:
-                fit = replace(fit, gain=fit.gain + log_normal(start.view.z)
-                              - _densities(view, start.view))
-            if best is None or _ahead(fit, best[0], view.train) > 0.0:
-                best = fit, start
-        if best is None or best[1].view is not view:
-            return best and best[0]
-        return cls._two_or_three(view, *best)
+    def variants(cls) -> Sequence[type[Term]]:
+        return (SwitchingLevels,)
 
     @classmethod
-    def _two_or_three(cls, view: View, two: LawFit, start: Start) -> LawFit:
-        """Return a fit of three states if it is better than the fit of two states."""
-        # Let three states differ in what differs between the two states: sigma or level.
-        trials = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
-        if two.power is None:
-            trials = [start.x * [1.0, 1.0, 0.6, 0.0, 1.0]]
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit a hidden chain of two or three states."""
+        start = _first_fit(view, cls.EVENTS)
+        two = cls._best_fit(start.view, [start.x], start.at_once, 80)
+        if two is None:
+            return None
+        if start.view is not view:
+            return replace(two, gain=two.gain + log_normal(start.view.z)
+                           - _densities(view, start.view))
+        # Three states if they are better.
         part, found = slice(0, min(view.train.stop, _LONG)), two
-        for trial in trials:
+        for trial in [start.x * [1.0, 1.0, 0.6, 0.0, 1.0]] if cls.EVENTS else [
+                np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]:
             three = cls._best_fit(view, [trial], start.at_once, 70, 3)
             if three is not None and _ahead(three, found, part) > _THIRD * (found is two):
                 found = three
@@ -371,16 +383,18 @@ class RegimeSwitching(Term):
 
     def refit_law(self, view: View) -> LawFit | None:
         unit = math.sqrt(float(np.median(view.variance)))
-        ratio = math.log(max(self.sigma_ratio, 1e-2))
-        states = int(self.states)
-        law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
-        square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        # Start from two scales: one from the mean square of the scores (1 if levels are clear),
-        # and 1, which is right if the `ou` already has the sigma of the lowest state.
-        mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
-        starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
-                            ratio, scale])
-                  for scale in (0.5 * math.log(mean / square), 0.0)]
+        rates, states = [math.log(self.rate_up), math.log(self.rate_down)], int(self.states)
+        if self.EVENTS:
+            starts = [np.array([*rates, self.level / unit, 0.0, 0.0])]
+        else:
+            ratio = math.log(max(self.sigma_ratio, 1e-2))
+            law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
+            square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
+            # Start from two scales: one from the mean square of the scores, and 1, which is right
+            # if the `ou` already has the sigma of the lowest state.
+            mean = float(np.mean(view.z[view.train] ** 2))
+            starts = [np.array([*rates, 0.0, ratio, scale])
+                      for scale in (0.5 * math.log(mean / square), 0.0)]
         return self._best_fit(view, starts, self.at_once, 40, states)
 
     @classmethod
@@ -392,16 +406,14 @@ class RegimeSwitching(Term):
         within = scores.part(part).following(starts[0], at_once, states)
 
         def value(x: FloatArray, middle: float | None = None) -> float:
-            if not _is_inside(x, view):
-                return -math.inf
-            return log_likelihood(*chain_of(within, x, at_once, states, middle)[0])
+            return _value(within, x, at_once, view, states, middle)
 
         start = max(starts, key=value)
         if states == 2:
             # Rates fitted to few changes are inaccurate; try rates counted over all samples too.
             counted = _counted_rates(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
             start = max(np.array(start), np.append(counted, start[2:]), key=value)
-        x, top = climb(value, start, size=0.2, most=most)
+        x, top = _climb_form(value, start, 0.2, most)
         if top == -math.inf:
             return None
         unit = math.sqrt(float(np.median(view.variance)))
@@ -417,18 +429,26 @@ class RegimeSwitching(Term):
         middle = float(chain[2] @ np.arange(states))
         e = curvature_se(lambda x: value(x, middle), x)
         se = {'rate_up': term.rate_up * float(e[0]), 'rate_down': term.rate_down * float(e[1]),
-              'level': unit * float(e[2]), 'sigma_ratio': term.sigma_ratio * float(e[3])}
+              **({'level': unit * float(e[2])} if cls.EVENTS else
+                 {'sigma_ratio': term.sigma_ratio * float(e[3])})}
         after = smoothed(*chain) @ np.arange(states)
         moved = term.level * (after - after.mean())
         if at_once == 0.0:
             moved = first_order(view.phi, (1.0 - view.phi) * moved, 0.0)
-        offset = None if abs(x[2]) < NO_LEVEL else moved
+        offset = moved if cls.EVENTS else None
         # Probabilities of the states, given the samples so far.
         known = np.concatenate((before[1:], before[-1:]))
         # Relative to the lowest state, so that the `ou` gets the sigma of the lowest state.
         power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
-        return LawFit(term, se, normal, density - log_normal(view.z), 5,
-                      power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
+        return LawFit(term, se, normal, density - log_normal(view.z), 4,
+                      power=None if cls.EVENTS else power, offset=offset)
+
+
+@dataclass(frozen=True)
+class SwitchingLevels(RegimeSwitching):
+    """Switch between levels, whose changes are events: a law of sigma may stand beside them."""
+
+    EVENTS = True
 
 
 def _counted_rates(before: FloatArray, step: float) -> FloatArray:
@@ -447,7 +467,7 @@ _SHORT, _LONG = 8000, 30000
 _FASTEST = 30.0  # Maximum rate of switching, 1/s
 _CHANGES = 8.0  # Minimum expected number of changes in the fitted part
 _THIRD = 10.0  # Minimum evidence for three states, nats
-_NO_RATIO = 0.05  # |ln(ratio of sigmas)| below which the sigmas count as equal
+_RATIO = 0.7  # Initial ln of the ratio of sigmas
 
 
 def _fastest(view: View) -> float:

@@ -439,6 +439,11 @@ class Term:
         """Fit the law to the normal scores (`Role.LAW`); None if that fails."""
         return None
 
+    @classmethod
+    def variants(cls) -> Sequence[type[Term]]:
+        """Return other classes of this NAME that the search tries; by default none."""
+        return ()
+
     def refit_law(self, view: View) -> LawFit | None:
         """Fit the law again to nearly the same scores; by default, from the beginning."""
         return type(self).fit_law(view)
