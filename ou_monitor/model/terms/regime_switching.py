@@ -344,7 +344,7 @@ class RegimeSwitching(Term):
     def holds(self, view: View) -> bool:
         """Return whether enough changes are expected to call them a random process."""
         rates = rates_between(self.rate_up, self.rate_down, int(self.states))
-        span = float(view.at[view.train.stop - 1] - view.at[0])
+        span = float(view.at[-1] - view.at[0])
         return float(stationary_law(rates) @ rates.sum(axis=1)) * span >= _CHANGES
 
     def objection(self, path: FloatArray, at: FloatArray) -> str:
@@ -465,7 +465,7 @@ _FASTER = 1.0, 3.0, 9.0
 # Number of samples for comparing starts, and for fitting from the best start.
 _SHORT, _LONG = 8000, 30000
 _FASTEST = 30.0  # Maximum rate of switching, 1/s
-_CHANGES = 8.0  # Minimum expected number of changes in the fitted part
+_CHANGES = 8.0  # Minimum expected number of changes in the recording
 _THIRD = 10.0  # Minimum evidence for three states, nats
 _RATIO = 0.7  # Initial ln of the ratio of sigmas
 

@@ -438,7 +438,7 @@ class Volatility(Term):
     SIGNS = ('clustering', 'kurtosis')
     IMITATES = ('heavy_tails', 'jumps', 'regime_switching')
     MEANING = 'sigma changes slowly at random, independent of throttle.'
-    REMEDY = 'Use an estimator window much shorter than 1/rate.'
+    REMEDY = 'Judge the noise by the last seconds, not by the mean of a flight.'
     SEPARATED_BY = 'a recording several times as long that includes the temperature'
 
     std: float = parameter('', 'standard deviation of ln sigma', 0.0)
@@ -468,8 +468,8 @@ class Volatility(Term):
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
     def holds(self, view: View) -> bool:
-        """Return whether the recording has enough relaxation times; else sigma has a trend."""
-        return self.rate * float(view.at[-1]) > _WANDERS
+        """Return whether sigma neither has a trend nor is drawn anew at nearly every sample."""
+        return _WANDERS / float(view.at[-1]) < self.rate < _FORGETS * view.rate
 
     @classmethod
     def _best_fit(cls, view: View, start: FloatArray, known: bool) -> LawFit | None:
@@ -562,6 +562,9 @@ _EVERY = 4  # Number of segments between normalisations, which prevent underflow
 # Minimum number of relaxation times of ln sigma in a recording: with 2, the standard error of the
 # logarithm of its variance is sqrt(2/2) = 1.
 _WANDERS = 2.0
+# Maximum rate of ln sigma, in samples per second: its neighbouring values correlate by one half.
+# With less, sigma is drawn anew at each sample, which is another law (heavy tails).
+_FORGETS = math.log(2.0)
 # Stationary probabilities of the levels.
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
 # Range of ln std, ln rate (1/s) and mean of ln sigma.
