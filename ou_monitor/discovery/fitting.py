@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -107,10 +108,10 @@ class Fitter:
     def _fit_apart(self, found: Composite, part: slice) -> Composite:
         """Fit the `APART` parameters of terms and all others in turn while evidence grows."""
         for _ in range(_AGAIN):
-            if not any(term.APART for term in found.terms):
-                break
             view = view_of(self.samples, found.gaussian, found.z, part)
-            terms = [term.apart(view) if term.APART else term for term in found.terms]
+            terms = [term.apart(view) for term in found.terms]
+            if all(map(is_, terms, found.terms)):
+                break
             again = self._fit(terms, part, found, rough=True)
             if again is None or not self.evidence(again) > self.evidence(found) + _ALIKE:
                 break
@@ -413,7 +414,7 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
         if at:
             values = gathered.setdefault(base, [NAN] * len(getattr(term, base)))
             values[int(at)] = float(value)
-        else:
+        elif name in term.parameters():
             gathered[name] = float(value)
     return gathered
 

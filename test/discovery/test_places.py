@@ -115,6 +115,23 @@ def test_white_noise_that_grows_as_the_square_of_throttle_is_white_noise():
     assert not {'load_dependent_alpha', 'second_relaxation'} & set(named(found))
 
 
+def test_a_law_of_white_noise_below_the_noise_of_the_rail_is_found_whole():
+    """It was found with a third of its slope, and a law of sigma or alpha made up for the rest."""
+    found = []
+    for seed in range(4):
+        u, rng = flown(seed), np.random.default_rng(seed)
+        v = SupplyModel((OU(40.0, 0.03, 15.0), LoadSag(0.5, 0.0))).simulate(T, rng, u)
+        v += 0.0007 * np.exp(1.6 * u) * rng.standard_normal(N)
+        causes = discover(Recording(T, v, u, 'made')).causes
+        found += [cause.term for cause in causes if {one.name for one in causes} == {
+            'load_sag', 'measurement_noise', 'load_dependent_noise'}
+            and cause.name == 'load_dependent_noise']
+    # The slopes scatter by 0.2, so their mean by 0.1; three times that.
+    factors = [term.factors()['throttle'] for term in found]
+    assert len(found) >= 3 and np.mean([
+        np.log(y[-1]) / (x[-1] - x[0]) for x, y in factors]) == pytest.approx(1.6, abs=0.3)
+
+
 def test_an_inrush_responds_to_rises_only():
     """A dip as throttle rises and none upwards as it falls is one transient, with its rise."""
     u = flown(6)

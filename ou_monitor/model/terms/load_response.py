@@ -507,7 +507,7 @@ class LoadDependentNoise(Term):
     # Penalty of the search for inputs and knots.
     SEARCH = by_parameters(0.0, lambda term: sum(
         _KNOT_COST * (values.size - 2) + _INPUT_COST for _, values in term.curves().values()))
-    APART = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
+    APART = by_parameters(0, lambda term: max(0, len(term.at) - len(set(term.number)) - 1))
     CHANGES = MeasurementNoise
     MEANING = (
         'The white noise of the readings depends on throttle or its changes: ripple of the ESCs, '
@@ -561,8 +561,21 @@ class LoadDependentNoise(Term):
         return effect
 
     def free(self) -> tuple[str, ...]:
-        """Return the power that multiplies sigma, if sigma follows the factor."""
-        return ('on_sigma',) if self.on_sigma else ()
+        """Return the scale of the logarithm, and the power on sigma if sigma follows it."""
+        # `apart` finds the form of the curves from squared scores, which a wrong scale biases.
+        return ('scale',) * bool(self.number) + ('on_sigma',) * bool(self.on_sigma)
+
+    def moved(self, name: str, by: float) -> LoadDependentNoise:
+        if name != 'scale':
+            return replace(self, on_sigma=min(self.on_sigma * math.exp(by), _MOST_POWER))
+        # The last curve, if any, gives the scale of the sum.
+        last = SUM in self.number
+        return replace(self, log_factor=tuple(
+            value * math.exp(by) if k == SUM or not last else value
+            for k, value in zip(self.number, self.log_factor, strict=True)))
+
+    def per_coordinate(self, name: str) -> float:
+        return 1.0 if name == 'scale' else super().per_coordinate(name)
 
     def log_of(self, inputs: Mapping[int, FloatArray]) -> FloatArray:
         """Return ln of the factor for the inputs that `Inputs` returns."""
@@ -579,7 +592,7 @@ class LoadDependentNoise(Term):
         if view.throttle is None:
             return []
         white = cls((), (), ()).apart(view)
-        return [white, replace(white, on_sigma=0.5)] if white.at else [white]
+        return [white, replace(white, on_sigma=1.0)] if white.at else [white]
 
     def apart(self, view: View) -> LoadDependentNoise:
         """Refit the curves, as factors on white noise only, to the scores of their model."""
@@ -615,7 +628,11 @@ class LoadDependentNoise(Term):
             tuple(float(value) for part in parts for value in part) for parts in (
                 [[k] * knots.size for k, (knots, _) in found.items()],
                 [knots for knots, _ in found.values()], [values for _, values in found.values()]))
-        return LoadDependentNoise(number, at, log_factor)
+        return replace(self, number=number, at=at, log_factor=log_factor)
+
+
+# Maximum power on sigma: then sigma alone follows the load, and the white noise hardly does.
+_MOST_POWER = 10.0
 
 
 class Inputs:
