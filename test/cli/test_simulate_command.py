@@ -209,8 +209,8 @@ def test_an_error_half_way_leaves_nothing(tmp_path, name, model, words, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ['m.yaml']
 
 
-@pytest.mark.parametrize('number, status', [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize('name', ['a.mcap', 'a'])
+@pytest.mark.parametrize('name, number, status', [
+    ('a.mcap', signal.SIGTERM, 143), ('a', signal.SIGINT, 130)])
 def test_a_signal_brings_the_old_bag_back(tmp_path, name, number, status):
     # An hour at 20 kHz lasts far longer than the test; the signal goes out once the bag has grown.
     path = tmp_path / name
