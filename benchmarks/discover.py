@@ -43,6 +43,7 @@ from ou_monitor import discover
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
+from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import guess
 from ou_monitor.model.supply import SupplyModel
@@ -343,6 +344,7 @@ class Injected:
     clean: tuple[str, ...]  # Names in the original piece.
     named: tuple[str, ...]
     alternatives: tuple[str, ...]
+    oracle: float  # Gain from the path of the effect, nats
 
     @property
     def outcome(self) -> str:
@@ -369,6 +371,24 @@ class Injected:
         return set(self.named) - set(self.clean) - EFFECTS[self.effect][1]
 
 
+# Gain of an oracle, nats, from which an effect should be named.
+TOLD = 300.0
+
+
+def oracle_gain(clean: Finding, piece: Recording, hidden: Recording) -> float:
+    """Return the loss of the original piece's model because of an effect that it lacks, nats."""
+    # An oracle that knows what was added to the voltage loses nothing.
+    samples = clean.samples
+    assert samples is not None
+    added = np.interp(samples.t - samples.t[0], piece.t - piece.t[0],
+                      hidden.voltage - piece.voltage)
+    fits = [fit_composite(replace(samples, voltage=voltage), clean.simulated.terms,
+                          slice(0, samples.n))
+            for voltage in (samples.voltage, samples.voltage + added)]
+    before, after = (-math.inf if fit is None else float(fit.density.sum()) for fit in fits)
+    return before - after if math.isfinite(before) else 0.0
+
+
 def injected(given: argparse.Namespace) -> str:
     """Hide effects in pieces of recorded runs."""
     rows, every = [], []
@@ -376,16 +396,18 @@ def injected(given: argparse.Namespace) -> str:
         at = whole.t - whole.t[0]
         part = (at >= PIECES[name][0]) & (at < PIECES[name][1])
         piece = Recording(whole.t[part], whole.voltage[part], whole.throttle[part])
-        clean = tuple(cause.name for cause in discover(piece).causes)
+        known = discover(piece)
+        clean = tuple(cause.name for cause in known.causes)
         say(f'{name}:', ', '.join(clean) or 'nothing')
         mine = []
         for effect in given.effects:
             rng = np.random.default_rng([given.seed, zlib.crc32(f'{name} {effect}'.encode())])
             strength = float(rng.uniform(*STRENGTHS))
-            found = discover(EFFECTS[effect][0](
-                piece, strength * noise_of(piece.voltage), rng)).causes
+            hidden = EFFECTS[effect][0](piece, strength * noise_of(piece.voltage), rng)
+            found = discover(hidden).causes
             mine.append(Injected(effect, strength, clean, tuple(one.name for one in found),
-                                 tuple(other for one in found for other in one.alternatives)))
+                                 tuple(other for one in found for other in one.alternatives),
+                                 oracle_gain(known, piece, hidden)))
             say(f'{name} {effect} x{strength:.1f}: {mine[-1].outcome};',
                 ', '.join(mine[-1].named) or 'nothing')
         every += mine
@@ -399,9 +421,11 @@ def injected(given: argparse.Namespace) -> str:
     rows.append(['named', *(f'{named[effect]} of {of[effect]}' for effect in given.effects),
                  f'{kept} of {had}', str(sum(len(one.false) for one in every))])
     found, had = named.total() / max(len(tried), 1), max(had, 1)
+    told = [one.outcome == 'yes' for one in tried if one.oracle >= TOLD]
     return table(['recording', *given.effects, 'own causes kept', 'named beside, times'], rows) + (
         f'\nNamed: {named.total()} of {len(tried)}, {100.0 * found:.0f} %; '
-        f'own causes kept: {100.0 * kept / had:.0f} %.\n')
+        f'own causes kept: {100.0 * kept / had:.0f} %. With the path of what was added, an oracle '
+        f'gains {TOLD:g} nats or more from {len(told)}, of which {sum(told)} were named.\n')
 
 
 def main() -> int:

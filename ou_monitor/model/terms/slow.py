@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
@@ -34,8 +35,11 @@ class Drift(Term):
     MEASURED = True
     # The form of a larger effect is never exact, and a trend may explain the little that is left.
     LEAST_SHARE = 0.02
-    MEANING = ('The mean moves slowly, by rate without load plus charge at full load (a fall is '
-               'negative): discharge or warming.')
+    MEANING: ClassVar[str] = by_parameters(
+        'The mean moves slowly (a fall is negative): discharge or warming.',
+        lambda term: Drift.MEANING.replace(
+            'slowly', 'slowly, by rate without load plus charge at full load')
+        if term.charge else Drift.MEANING)
     REMEDY = 'Use a window in which the drift is small, or remove the trend first.'
     SEPARATED_BY = 'a recording several times as long'
 
