@@ -8,7 +8,7 @@ from ou_monitor import AdaptiveLowPass
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.fitting import from_spectrum
-from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.regime_switching import RegimeSwitching, SwitchingLevels
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import patience, StampWatch
@@ -139,7 +139,7 @@ def latent():
                        'at_once': 1.0, 'states': 3.0})):
         samples = samples_of(2500, term('regime_switching', **params), seed=152)
         view = view_at(samples, share=0.8)
-        fit = catalogue()['regime_switching'].fit_law(view)
+        fit = (SwitchingLevels if params['level'] else RegimeSwitching).fit_law(view)
         again = fit.term.refit_law(view)
         found[name] = table([fit.term.values(), fit.se, float(fit.gain.sum()), fit.z[::300],
                              again.term.values(), float(again.gain.sum()),
