@@ -382,11 +382,11 @@ def oracle_gain(clean: Finding, piece: Recording, hidden: Recording) -> float:
     assert samples is not None
     added = np.interp(samples.t - samples.t[0], piece.t - piece.t[0],
                       hidden.voltage - piece.voltage)
-    fits = [fit_composite(replace(samples, voltage=voltage), clean.simulated.terms,
-                          slice(0, samples.n))
-            for voltage in (samples.voltage, samples.voltage + added)]
-    before, after = (-math.inf if fit is None else float(fit.density.sum()) for fit in fits)
-    return before - after if math.isfinite(before) else 0.0
+    # A fit that fails has a parameter out of its range.
+    before, after = (None if fit is None else float(fit.density.sum()) for fit in (
+        Fitter(replace(samples, voltage=voltage)).fit(clean.simulated.terms, None)
+        for voltage in (samples.voltage, samples.voltage + added)))
+    return 0.0 if before is None else math.inf if after is None else before - after
 
 
 def injected(given: argparse.Namespace) -> str:
