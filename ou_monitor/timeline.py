@@ -320,28 +320,33 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     """
     Return a recording without wild readings and without the times when its supply was off.
 
-    Notes report what was left out.  A supply is off below `OFF` of its usual voltage; the outage
-    includes adjacent readings below `_ON`.  If the supply is low too often, or mostly between
-    `OFF` and `_ON`, all readings are kept.
+    Notes report what was left out.  Readings above `WILD_FACTOR` times the usual voltage, and
+    single ones below `OFF` times it, are wild.  A supply is off below `OFF` of its usual voltage;
+    the outage includes adjacent readings below `_ON`.  If the supply is low too often, or mostly
+    between `OFF` and `_ON`, all readings are kept.
     at_ends: leave out only outages at the start and the end of the recording.
     """
     usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
-    wild = recording.voltage > WILD_FACTOR * usual
-    if usual > 0.0 and wild.any() and wild.sum() <= _FEW * recording.n:
-        recording = part_of(recording, ~wild, (
-            f'{counted(int(wild.sum()))} left out: up to {float(recording.voltage.max()):.6g} V, '
-            f'where {usual:.3g} V is usual.'))
-    t, v = recording.t, recording.voltage
-    off = v < OFF * usual
-    if not usual > 0.0 or not off.any():
+    if not usual > 0.0:
         return recording
-    low = v < _ON * usual
+    low = recording.voltage < _ON * usual
+    beside = np.append(False, low[:-1]) | np.append(low[1:], False)
+    wild = np.isfinite(recording.voltage) & (recording.voltage > WILD_FACTOR * usual) | (
+        recording.voltage < OFF * usual) & ~beside
+    if 0 < wild.sum() <= max(1.0, _FEW * recording.n):
+        between = dict.fromkeys(f'{x:.6g} V' for x in np.sort(recording.voltage[wild])[[0, -1]])
+        recording = part_of(recording, ~wild, (
+            f'{counted(int(wild.sum()))} left out: {" to ".join(between)}, where {usual:.3g} V is '
+            'usual.'))
+    t, v = recording.t, recording.voltage
+    off, low = v < OFF * usual, v < _ON * usual
+    if not off.any():
+        return recording
     edges = np.flatnonzero(np.diff(low, prepend=False, append=False))
     begins, ends = edges[::2], edges[1::2]
     gone = np.logical_or.reduceat(off, begins)
     begins, ends = begins[gone], ends[gone]
-    between = int((low & ~off).sum())
-    if (begins.size > max(_OUTAGES, _FEW * v.size) or between > _BETWEEN * off.sum()
+    if (begins.size > max(_OUTAGES, _FEW * v.size) or (low & ~off).sum() > _BETWEEN * off.sum()
             or (ends - begins).sum() > _MOST_OFF * v.size):
         return recording
     if at_ends:

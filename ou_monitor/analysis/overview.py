@@ -76,7 +76,8 @@ class Overview:
     # than `facts.ou` and agrees with it.
     whole: OuFacts | None = None
     beware: tuple[str, ...] = ()  # Warnings that change the meaning of every number
-    pauses: str = ''  # Times without usable samples, as the end of a sentence
+    pauses: str = ''  # Pauses, and samples left out, as the end of a sentence
+    readings: int = 0  # Number of readings, with those that are left out
     # Whether the relaxation is no larger than the rounding error of the ADC, which looks like one
     # under slow changes: of 12 simulated packs with white noise, 8 to 12 then have a relaxation.
     rounding: bool = False
@@ -113,8 +114,13 @@ def overview(recording: Recording, limit: float | None = None,
                     _largest(recording), _growth(recording, facts.noise, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
-                    beware(recording, cells), pause_words(supplied(recording).t),
+                    beware(recording, cells), _not_there(recording), recording.n,
                     find_step(recording.voltage[:EXAMINED]) ** 2 / 12.0 > facts.ou.var_inf)
+
+
+def _not_there(recording: Recording) -> str:
+    left_out = recording.n - supplied(recording).n
+    return pause_words(recording.t) + f'; {left_out} left out' * (left_out > 0)
 
 
 def _growth(recording: Recording, noise: Noise, near: Sequence[int]) -> float:

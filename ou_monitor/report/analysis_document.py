@@ -39,11 +39,12 @@ _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
 
 def analysis_document(analysis: Analysis) -> Document:
     recording = analysis.recording
-    rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
-    subject = (f'{recording.name}: {recording.n} samples in '
-               f'{recording.duration:.4g} s ({number(rate)} Hz){analysis.overview.pauses}')
+    seen = analysis.overview
+    rate = (seen.readings - 1) / seen.duration if seen.duration > 0.0 else NAN
+    subject = (f'{recording.name}: {counted(seen.readings)} in {seen.duration:.4g} s '
+               f'({number(rate)} Hz){seen.pauses}')
     parts: list[Part] = [
-        lambda: [Figure(_with_segments(voltage_plot(recording, analysis.overview.limit),
+        lambda: [Figure(_with_segments(voltage_plot(recording, seen.limit),
                                        analysis))],
         Facts([*facts(analysis), *_origin(analysis)]),
         Section('What to know before using these numbers', [notes(analysis)]),

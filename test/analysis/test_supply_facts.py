@@ -98,6 +98,22 @@ def test_a_supply_that_is_off_counts_within_the_recording_for_lowest_and_dips_on
     assert found.recording.n == others.size and repr(found.overview.facts) == repr(off)
 
 
+@pytest.mark.parametrize('value, size, left_out', [
+    (-3.0, 1, True), (0.0, 1, True), (0.0, 2, False), (-3.0, 12, False)])
+def test_a_single_impossible_reading_is_unknown_and_a_brownout_is_not(value, size, left_out):
+    whole = flight(np.random.default_rng(4))
+    v = whole.voltage.copy()
+    v[2000:2000 + size] = value
+    found = analyze(replace(whole, voltage=v), brownout_voltage=13.0)
+    facts, others = found.overview.facts, np.delete(np.arange(v.size), 2000)
+    assert any(f'1 sample left out: {value:g} V' in note for note in found.notes) == left_out
+    if left_out:
+        assert repr(facts) == repr(supply_facts(
+            Recording(whole.t[others], whole.voltage[others], whole.throttle[others]), 13.0))
+    else:
+        assert facts.lowest.voltage_v == value and facts.dips.seconds > 0.99 * size / RATE
+
+
 def test_error_codes_change_no_fact():
     whole = flight(np.random.default_rng(4))
     v = whole.voltage.copy()

@@ -137,12 +137,14 @@ def test_a_limit_per_cell_for_a_whole_pack_is_questioned(limit, warned):
 
 @pytest.mark.parametrize('command', [bench.analyze, bench.compare, bench.discover])
 def test_the_first_line_says_that_the_log_pauses(command):
-    """A link that is lost for 20 s, or a supply that is off for 5 s; nothing of a whole log."""
+    """A link that is lost for 20 s; not a supply that is off for 5 s, whose samples are there."""
     t, v, u = flown(1)
-    there = (t < 10.0) | (t > 30.0)
-    off = np.where((t > 20.0) & (t < 25.0), 0.0, v)
+    there, off = (t < 10.0) | (t > 30.0), (t > 20.0) & (t < 25.0)
     for samples, words in (((t[there], v[there], u[there]), '20 s in all'),
-                           ((t, off, u), '5 s in all'), ((t, v, u), '')):
-        subject = command(Recording(*samples)).document().subject
+                           ((t, np.where(off, 0.0, v), u), ''), ((t, v, u), '')):
+        found = command(Recording(*samples))
+        subject = found.document().subject
         assert ('; 1 pause without usable samples, ' in subject) == bool(words)
         assert words in subject
+        assert f'; {off.sum()} left out' in subject or 0.0 not in samples[1]
+        assert command is not bench.analyze or f'{samples[0].size} samples in ' in subject
