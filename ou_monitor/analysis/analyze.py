@@ -31,6 +31,7 @@ from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.risk.courses import throttle_gap
 from ou_monitor.online.settings import DEFAULT_LIMIT, MonitorSettings, RAIL
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
@@ -208,6 +209,11 @@ class ByThrottle:
     horizon: float
     time: float  # Stamp of the risk, s; NaN if the recording is shorter than a window
 
+    @property
+    def safe(self) -> bool:
+        """Return whether any throttle is within the budget, which may be idle."""
+        return self.budget > 0.0 or bool(self.risk[0] <= self.limit)
+
 
 def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: float,
                 ) -> ByThrottle:
@@ -216,7 +222,9 @@ def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: 
     risk = np.full(grid.size, NAN)
     if last is not None and last.risk_curve:
         # RISK_CURVE has the throttles of `grid`; keep one above the highest flown, to interpolate.
-        risk = np.where(grid >= found.highest + 0.1, NAN, last.risk_curve)
+        low, high = throttle_gap(recording.throttle)
+        risk = np.where((grid >= found.highest + 0.1) | (grid > low) & (grid < high), NAN,
+                        last.risk_curve)
     return ByThrottle(
         grid, flown_near(recording, grid), risk, NAN if last is None else last.budget,
         'No voltage limit was given.' if last is None else last.budget_reason,

@@ -70,7 +70,7 @@ def answer(analysis: Analysis) -> list[str]:
     safe = [] if math.isnan(curves.budget) else [
         f'At the end of the recording, {100.0 * curves.budget:.0f} % throttle is safe for '
         f'{curves.horizon:g} s{_fall_within_budget(analysis)}.'
-        if curves.budget > 0.0 else
+        if curves.safe else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
         f'{_why_no_throttle(analysis)}.']
     supply = [first, *safe, *others, *craft_advice(analysis.craft)]
@@ -122,7 +122,7 @@ def _budget(analysis: Analysis) -> str:
                       '; ou-monitor design --from RECORDING takes the current as the load'
                       if math.isfinite(analysis.overview.facts.resistance.ohm) else ''))
         return f'unknown: {reason}'
-    if not curves.budget:
+    if not curves.safe:
         return (f'no throttle, {_why_no_throttle(analysis)}: the risk {what} is '
                 f'{curves.risk[0]:.2g}')
     words = (f'{100.0 * curves.budget:.0f} % throttle if held at the end of the recording: the '

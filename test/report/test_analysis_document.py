@@ -100,6 +100,17 @@ def test_a_missing_budget_states_the_voltages(analysis):
         'rest: the risk of falling below 13.2 V within 5 s is 0.3')
 
 
+def test_a_switched_load_has_a_risk_at_its_two_throttles_only():
+    u = np.repeat(np.random.default_rng(2).integers(0, 2, 60), 50).astype(float)
+    u[-25:] = 0.0
+    v = 16.0 - 2.0 * u + 0.03 * np.random.default_rng(3).standard_normal(u.size)
+    found = analyze(Recording(np.arange(u.size) / 50.0, v, u), brownout_voltage=14.0)
+    assert 'At the end of the recording, 0 % throttle is safe for 5 s' in ' '.join(answer(found))
+    words = dict(facts(found))['Safe up to']
+    assert words.startswith('0 % throttle if held') and '; at 100 % it is ' in words
+    assert np.flatnonzero(np.isfinite(found.by_throttle.risk)).tolist() == [0, 10]
+
+
 def test_a_throttle_just_beyond_the_budget_counts_as_flown(analysis):
     """Its risk is below twice the limit, so it was called not flown."""
     curves = analysis.by_throttle

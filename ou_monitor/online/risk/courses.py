@@ -45,6 +45,8 @@ _SHARE_OF_RISE = INRUSH_TIME / _RAMP
 
 # Length of a block, s; time that is kept, s; maximum silence that is filled, s.
 BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
+# Minimum width of a gap in the throttle flown across which nothing is interpolated (our choice).
+_WIDE = 0.5
 # Throttle within this distance of the highest throttle belongs to the peak.
 AT_PEAK = 0.05
 # `brief`, the squared relative error of the predicted fall, falls from 1 for a peak of one block
@@ -293,6 +295,15 @@ class FlightHistory:
             return np.empty(0)
         drop = last[:-width] - sliding(np.minimum, low[1:], width)
         return np.asarray(drop[np.isfinite(drop)])
+
+
+def throttle_gap(throttle: FloatArray) -> tuple[float, float]:
+    """Return the ends of the widest gap in throttle, as of a switched load; NaN: none is wide."""
+    values = np.unique(throttle[np.isfinite(throttle)])
+    if values.size < 2 or not np.diff(values).max() > _WIDE:
+        return NAN, NAN
+    k = int(np.argmax(np.diff(values)))
+    return values.item(k), values.item(k + 1)
 
 
 def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:

@@ -40,7 +40,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState, LoadStatus, SupplyLoad
 from ou_monitor.online.risk.courses import (
     BLOCK, Courses, excursion_risk, excursions, FlightHistory, flown, FlownHorizons, held, lowest,
-    mean_now, pilot, Sampling)
+    mean_now, pilot, Sampling, throttle_gap)
 from ou_monitor.online.risk.first_passage import Passage, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
@@ -369,6 +369,11 @@ class Forecast:
         return self._past.flown()
 
     @property
+    def gap(self) -> tuple[float, float]:
+        """Return the ends of a wide gap in the throttle of the last minutes; NaN without one."""
+        return throttle_gap(self._past.table[3])
+
+    @property
     def throttle(self) -> float:
         """Return the present throttle; NaN if the load is unknown."""
         state = self._state()
@@ -522,10 +527,8 @@ class Forecast:
         """Return the risk within each horizon, s, by the law of that horizon alone; (k,)."""
         # Drops and misses of this flight are due to its sag, and change with it by the factor sag.
         now, drops = self.voltage, [sag * self._drops(one)[1] for one in horizons]
-        if now <= voltage:
-            return [np.ones(u.shape)] * len(horizons)
         if state is None or math.isnan(now) or np.isnan(drops).any():
-            return [np.full(u.shape, NAN)] * len(horizons)
+            return [np.full(u.shape, 1.0 if now <= voltage else NAN)] * len(horizons)
         within = np.repeat(horizons, u.size)
         courses = held(np.tile(u, len(horizons)), np.minimum(dwell, within), state.throttle)
         parts = np.split(np.stack(lowest(state, courses, within, self._sampling)),
@@ -536,7 +539,9 @@ class Forecast:
             middle, spread = moments(law, list(part), start)
             either = below(voltage, middle, np.stack((
                 _wider(spread, deviation, (n, sag * sag * squares)), spread)))
-            risks.append(wrong * either[0] + (1.0 - wrong) * either[1])
+            risk = wrong * either[0] + (1.0 - wrong) * either[1]
+            # Below the level now, only less throttle can raise the voltage above it.
+            risks.append(np.where((now <= voltage) & (u >= state.throttle), 1.0, risk))
         return risks
 
     def _state(self) -> LoadState | None:
@@ -587,7 +592,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return RiskOutlook(outcome, NAN, why, soon=soon)
-    budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
+    budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit, forecast.gap)
     # The comparison is false for NaN.
     return RiskOutlook(outcome, budget, reason, tuple(risks[::5].tolist()), soon,
                        budget < forecast.used)
@@ -604,7 +609,8 @@ def _rising(risks: FloatArray) -> FloatArray:
     return np.asarray(np.minimum.accumulate(risks[::-1])[::-1])
 
 
-def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:
+def throttle_budget(risks: FloatArray, highest: float, limit: float,
+                    gap: tuple[float, float] = (NAN, NAN)) -> tuple[float, str]:
     """Return the highest throttle with a risk within a limit (0: none), and why; risks: (51,)."""
     # The budget ends at the first throttle above the limit, even if the risk falls again beyond.
     risks = np.maximum.accumulate(risks)
@@ -617,6 +623,9 @@ def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[fl
         # Interpolate the logarithm of the risk, which is nearly linear over this distance.
         end = float(_GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
             math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0))
+    if gap[0] < end < gap[1]:
+        return gap[0], (f'No data between {gap[0]:.2f} and {gap[1]:.2f}; the risk is within the '
+                        'limit up to there.')
     if end <= highest:
         return end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
     return highest, ('The risk is within the limit up to full throttle.' if highest == 1.0 else
