@@ -35,8 +35,9 @@ HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
 _PACK = 3.5
 # Maximum number of cells that is guessed: 100 V, the limit of common high-voltage ESCs.
 _MOST_GUESSED = 24
-# Lowest usual voltage of a cell at rest, V: half full.
-_HALF = 3.8
+# Lowest usual voltage of a cell at rest, V: half full; highest of a full LiHV cell (4.35 V, and
+# 0.03 V for the sensor).
+_HALF, _FULL_HIGH = 3.8, 4.38
 # Cells of common LiFePO4 packs, and the plateau of such a cell at rest, V.
 _IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
@@ -135,14 +136,15 @@ def full_voltage(recording: Recording) -> float:
 def likely_cells(full: float) -> tuple[int, ...]:
     """Return the numbers of cells that a voltage at rest, V, cannot tell apart."""
     possible = [n for n in range(1, _MOST_GUESSED + 1) if _PACK <= full / n <= HIGHEST_CELL]
+    # A pack that is not between half and full is full LiHV rather than nearly empty.
     return tuple(n for n in possible if _HALF <= full / n <= FULL_CELL) or tuple(
-        sorted(possible, key=lambda n: abs(full / n - 0.5 * (_HALF + FULL_CELL)))[:1])
+        [n for n in possible if full / n <= _FULL_HIGH] or possible)[:1]
 
 
 def cells_among(full: float, known: Iterable[int]) -> int:
     """Return which number of a vehicle's flights one with this voltage at rest has; 0: unknown."""
     # A flight that ends an empty pack begins below any usual voltage.
-    usual = any(full / n <= FULL_CELL for n in likely_cells(full))
+    usual = any(full / n <= _FULL_HIGH for n in likely_cells(full))
     fit = [n for n in known if (_PACK if usual else _BEGINS) <= full / n <= HIGHEST_CELL]
     return 0 if usual and len(fit) > 1 else max(fit, default=0)
 

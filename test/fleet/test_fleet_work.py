@@ -323,7 +323,7 @@ def test_a_recording_whose_voltage_means_nothing_is_left_out(tmp_path, factor, w
 
 @pytest.mark.parametrize('full, others, cells', [
     (13.6, (4,), 4), (13.2, (4,), 4), (5.1, (4,), 0), (12.6, (4,), 3), (16.8, (5,), 4),
-    (21.2, (6,), 0), (66.0, (), 0), (66.0, (16,), 16), (66.0, (16, 17), 0)])
+    (26.1, (6, 8), 6), (21.2, (6,), 0), (66.0, (), 0), (66.0, (16,), 16), (66.0, (16, 17), 0)])
 def test_a_pack_has_the_cells_that_its_vehicle_allows(full, others, cells):
     """13.2 V is four empty cells rather than three overfull ones; 21.2 V may be 5 or 6."""
     guess = likely_cells(full)
