@@ -152,7 +152,8 @@ TOPICS = (
 # Format of a CSV, if it is not detected correctly.
 CSV = (
     Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
-    Option('--unit', choices=('V', 'mV'), help='unit of the voltage in a CSV (default: detected)'),
+    Option('--unit', choices=('V', 'dV', 'cV', 'mV', 'uV'),
+           help='unit of the voltage in a CSV (default: detected)'),
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
            help='unit of the time in a CSV (default: detected)'),
     Option('--throttle-unit', metavar='{1,%,us,LOW:HIGH}', type=ends,

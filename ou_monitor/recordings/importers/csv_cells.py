@@ -254,8 +254,8 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Number of values of a 32-bit counter.
 _COUNTS = 2.0**32
-# Maximum voltage of a pack, V. Without a unit, larger values are mV; whole numbers down to a tenth
-# of it may be ADC counts, and are refused.
+# Maximum voltage of a pack, V. Without a unit, larger values are mV, or uV (as Linux reports) if$
+# too large for that; whole numbers down to a tenth of it may be ADC counts, and are refused.
 MOST_VOLTS = 1000.0
 # Peak above which a throttle without a unit is percent, not a lever's voltage of up to 5 V.
 _LEAST_PERCENT = 5.5
@@ -395,7 +395,7 @@ def in_si(path: Path, quantity: str, column: FileColumn, values: FloatArray, giv
         if 0.1 * MOST_VOLTS < usual <= MOST_VOLTS and (known == np.rint(known)).all():
             raise InputError(f"{path}: '{column.name}' has whole numbers about {usual:g} and no "
                              'stated unit: convert counts to V, or give --unit V or mV')
-        unit = 'mV' if usual > MOST_VOLTS else 'V'
+        unit = next((one for one in ('V', 'mV') if usual * SCALES[one] <= MOST_VOLTS), 'uV')
         words = ', a guess: ' + '--voltage-column and ' * column.guess + '--unit'
     return values * SCALES[unit], unit + words
 

@@ -147,7 +147,7 @@ class CsvColumns:
     time: str | None = None
     voltage: str | None = None
     throttle: str | None = None
-    # Units: V or mV; s, ms, us or ns; 1, %, us or the ends LOW:HIGH.
+    # Units: V, dV, cV, mV or uV; s, ms, us or ns; 1, %, us or the ends LOW:HIGH.
     unit: str | None = None
     time_unit: str | None = None
     throttle_unit: str | None = None

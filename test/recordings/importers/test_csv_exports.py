@@ -772,10 +772,12 @@ def test_several_series_and_counts_are_refused(header, row, words, tmp_path):
     # Decimals between semicolons, although three of them.
     ('t [s];U [V]', lambda k: f'{0.1 * k:.3f};{V[k]:.3f}', 'V'),
     ('time,voltage', lambda k: f'{0.1 * k:.1f},{V[k]}', 'V, a guess: --unit'),
+    ('time,voltage', lambda k: f'{0.1 * k:.1f},{1e6 * V[k]:.0f}', 'uV, a guess: --unit'),
     ('time,CH1', lambda k: f'{0.1 * k:.1f},{V[k]}', 'V, a guess: --voltage-column and --unit')])
 def test_the_unit_and_the_column_of_a_voltage_are_marked_if_guessed(header, row, told, tmp_path):
-    note = read_recording(written(tmp_path, table([header], row))).notes[0]
-    assert f"' ({told})" in note.split('voltage from')[1]
+    found = read_recording(written(tmp_path, table([header], row)))
+    assert f"' ({told})" in found.notes[0].split('voltage from')[1]
+    assert 1.0 < np.median(found.voltage) < 20.0
 
 
 @pytest.mark.parametrize('header', [
@@ -1032,6 +1034,9 @@ def test_options_of_the_command_line(tmp_path, capsys):
     given = ['--sample-interval', '0.01', '--delimiter', ';', '--decimal', ',', '--unit', 'mV']
     assert main(['analyze', str(path), *given, '--json', str(tmp_path / 'a.json')]) == 0
     assert "voltage from 'U' (mV)" in ' '.join(capsys.readouterr().out.split())
+    for unit in ('dV', 'cV', 'uV'):
+        assert main(['analyze', str(path), *given, '--unit', unit]) == 0
+        assert f"voltage from 'U' ({unit})" in ' '.join(capsys.readouterr().out.split())
     assert main(['convert', str(path), str(tmp_path / 'bag'), *given]) == 0
     found = read_recording(tmp_path / 'bag')
     np.testing.assert_allclose(found.t, 0.01 * np.arange(300), atol=1e-9)
