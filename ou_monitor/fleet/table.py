@@ -126,12 +126,8 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
         flight=flight, path=printable(source.path), start_from=base['start_from'] or None,
         size_bytes=source.size, error=result['error'] or None,
         duplicate_of=None if duplicate_of is None else printable(duplicate_of))
-    return [{name: _null_if_unknown(value) for name, value in {**base, **level}.items()}
-            for level in levels]
-
-
-def _null_if_unknown(value: Any) -> Any:
-    return None if isinstance(value, float) and math.isnan(value) else value
+    return [{name: None if isinstance(value, float) and math.isnan(value) else value
+             for name, value in {**base, **level}.items()} for level in levels]
 
 
 def _as_text(value: Any) -> Any:

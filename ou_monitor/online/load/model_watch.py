@@ -80,14 +80,9 @@ class ModelComparison:
     def fields(self) -> dict[str, object]:
         """Return the published fields; the interval of the sag ratio consists of two numbers."""
         values = {f'model_{f.name}': getattr(self, f.name) for f in fields(self)}
-        low, high = self.sag_ratio_95
+        low, high = (self.sag_ratio + z * self.sag_ratio_se for z in (-1.96, 1.96))
         return values | {'model_verdict': self.verdict.name,
                          'model_sag_ratio_95': f'{low!r} {high!r}'}
-
-    @property
-    def sag_ratio_95(self) -> tuple[float, float]:
-        """Return the 95 % interval of the sag ratio."""
-        return self.sag_ratio - 1.96 * self.sag_ratio_se, self.sag_ratio + 1.96 * self.sag_ratio_se
 
 
 @dataclass(frozen=True)

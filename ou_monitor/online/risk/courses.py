@@ -250,11 +250,6 @@ class FlightHistory:
             self._start += extra * BLOCK
         self.table = table
 
-    def flown(self) -> tuple[float, float]:
-        """Return the lowest and the highest throttle; NaN if none is known."""
-        known = self.table[2:, np.isfinite(self.table[2])]
-        return (float(known[0].min()), float(known[1].max())) if known.size else (NAN, NAN)
-
     def throttles(self, seconds: float, ago: float) -> FloatArray:
         """Return the mean throttle of each block in a span, s, that ended `ago` s before now."""
         end = self.table.shape[1] - round(ago / BLOCK)
@@ -298,12 +293,10 @@ class FlightHistory:
 
 
 def throttle_gap(throttle: FloatArray) -> tuple[float, float]:
-    """Return the ends of the widest gap in throttle, as of a switched load; NaN: none is wide."""
+    """Return the ends of the first wide gap in throttle, as of a switch; NaN without one."""
     values = np.unique(throttle[np.isfinite(throttle)])
-    if values.size < 2 or not np.diff(values).max() > _WIDE:
-        return NAN, NAN
-    k = int(np.argmax(np.diff(values)))
-    return values.item(k), values.item(k + 1)
+    wide = np.flatnonzero(np.diff(values) > _WIDE)
+    return (values.item(wide[0]), values.item(wide[0] + 1)) if wide.size else (NAN, NAN)
 
 
 def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:

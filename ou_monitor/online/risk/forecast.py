@@ -364,14 +364,9 @@ class Forecast:
         self._last = np.concatenate((self._last, v))[-3:]
 
     @property
-    def flown(self) -> tuple[float, float]:
-        """Return the lowest and the highest throttle of the last minutes; NaN if unknown."""
-        return self._past.flown()
-
-    @property
-    def gap(self) -> tuple[float, float]:
-        """Return the ends of a wide gap in the throttle of the last minutes; NaN without one."""
-        return throttle_gap(self._past.table[3])
+    def flown(self) -> FloatArray:
+        """Return the highest throttle of each block of the last minutes; NaN where unknown."""
+        return np.asarray(self._past.table[3])
 
     @property
     def throttle(self) -> float:
@@ -592,7 +587,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return RiskOutlook(outcome, NAN, why, soon=soon)
-    budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit, forecast.gap)
+    budget, reason = throttle_budget(risks, forecast.flown, s.budget_limit)
     # The comparison is false for NaN.
     return RiskOutlook(outcome, budget, reason, tuple(risks[::5].tolist()), soon,
                        budget < forecast.used)
@@ -609,8 +604,7 @@ def _rising(risks: FloatArray) -> FloatArray:
     return np.asarray(np.minimum.accumulate(risks[::-1])[::-1])
 
 
-def throttle_budget(risks: FloatArray, highest: float, limit: float,
-                    gap: tuple[float, float] = (NAN, NAN)) -> tuple[float, str]:
+def throttle_budget(risks: FloatArray, flown: FloatArray, limit: float) -> tuple[float, str]:
     """Return the highest throttle with a risk within a limit (0: none), and why; risks: (51,)."""
     # The budget ends at the first throttle above the limit, even if the risk falls again beyond.
     risks = np.maximum.accumulate(risks)
@@ -623,9 +617,11 @@ def throttle_budget(risks: FloatArray, highest: float, limit: float,
         # Interpolate the logarithm of the risk, which is nearly linear over this distance.
         end = float(_GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
             math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0))
+    gap = throttle_gap(flown)
     if gap[0] < end < gap[1]:
         return gap[0], (f'No data between {gap[0]:.2f} and {gap[1]:.2f}; the risk is within the '
                         'limit up to there.')
+    highest = float(np.fmax.reduce(flown, initial=NAN))
     if end <= highest:
         return end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
     return highest, ('The risk is within the limit up to full throttle.' if highest == 1.0 else

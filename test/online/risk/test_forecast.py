@@ -370,7 +370,7 @@ GRID = np.linspace(0.0, 1.0, 51)
 
 
 def budget(risks, limit=1e-2, highest=0.9):
-    return throttle_budget(np.asarray(risks), highest, limit)
+    return throttle_budget(np.asarray(risks), np.linspace(0.0, highest, 9), limit)
 
 
 @pytest.mark.parametrize('limit', [1e-6, 1e-4, 1e-3, 1e-2, 0.1])
