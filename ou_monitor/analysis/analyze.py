@@ -35,7 +35,7 @@ from ou_monitor.online.risk.courses import throttle_gap
 from ou_monitor.online.settings import DEFAULT_LIMIT, MonitorSettings, RAIL
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
-from ou_monitor.timeline import readings_of, supplied
+from ou_monitor.timeline import pause_words, readings_of, supplied
 
 Progress = Callable[[float], None]
 
@@ -97,7 +97,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                          ('IMPULSES', [one for one in judged if one.estimate.usable
                                        and one.verdict.within is ProcessType.IMPULSES]))
                          for item in noise_items(name, [one.throttle for one in at])],
-                     seen.facts.ou.status == 'ok'),
+                     seen.facts.ou.status == 'ok', pause_words(all_of_it.t)),
         brownout_voltage is None, recording.notes + _left_out(recording, found), seen,
         craft, alarms(all_of_it, craft.cells, seen.facts.noise))
 

@@ -185,7 +185,8 @@ def answers(found: Overview) -> list[str]:
     if seen and found.facts.sag.known:
         parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
     elif fall := _fall_words(found):
-        without = '' if math.isnan(found.highest) else '; no sag over throttle is measurable'
+        without = '' if seen or math.isnan(found.highest) else (
+            '; no sag over throttle is measurable')
         parts.append(f'The resistance lowers the rail by {fall} (computed){without}.')
     elif not seen and sag + se > 0.0:
         parts.append(f'The sag at {100.0 * at:.0f} % throttle is below {volts(sag + 2.0 * se)}.')

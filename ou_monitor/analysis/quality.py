@@ -21,7 +21,7 @@ from ou_monitor.criticism.readings import why_stuck
 from ou_monitor.online.trust import MOST_SUPPLY
 from ou_monitor.records import (
     clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
-from ou_monitor.timeline import pause_words, scatter_words
+from ou_monitor.timeline import scatter_words
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -59,8 +59,10 @@ class QualityItem:
 
 
 def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
-                 more: Sequence[QualityItem] = (), known: bool = False) -> tuple[QualityItem, ...]:
+                 more: Sequence[QualityItem] = (), known: bool = False, pauses: str = '',
+                 ) -> tuple[QualityItem, ...]:
     """Return all cautions, worst first (known: alpha of the whole recording is determined)."""
+    # pauses: of the recording with the samples that were left out, by `pause_words`.
     found: dict[tuple[str, Severity, str], list[float]] = {}
     for throttle, estimate in zip(throttles, estimates):
         for doubt in _fit_doubts(estimate, known):
@@ -71,6 +73,9 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     for note in recording.notes:
         defect = defect_of(note)
         items.append(QualityItem(defect.name, defect.severity, note))
+    if pauses:
+        items.append(QualityItem('PAUSES', Severity.WARNING,
+                                 f'{pauses[2:]}; no level spans a pause.'))
     items = _unit_items(recording) + items + _stamp_items(recording) + _sample_items(recording)
     return tuple(sorted(items, key=lambda item: -item.severity))
 
@@ -139,9 +144,6 @@ def _stamp_items(recording: Recording) -> list[QualityItem]:
     if recording.n < 3:
         return []
     items = []
-    if pauses := pause_words(recording.t):
-        items.append(QualityItem('PAUSES', Severity.WARNING,
-                                 f'{pauses[2:]}; no level spans a pause.'))
     if scatter := scatter_words(recording.t, _UNEVEN):
         items.append(QualityItem('UNEVEN_CLOCK', Severity.INFO,
                                  f'{scatter}: the spectra assume even steps.'))

@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor.analysis.quality import quality_list, QualityItem
 from ou_monitor.records import (
     Defect, defect_of, Estimate, Flag, Note, prefixed, Recording, Severity, Status)
-from ou_monitor.timeline import in_order, readings_of
+from ou_monitor.timeline import in_order, pause_words, readings_of
 import pytest
 from simulated_recordings import recording
 
@@ -18,7 +18,8 @@ BACK = np.concatenate((np.arange(900.0), np.arange(900.0) - 1.5)) / 450.0
 
 
 def listed(simulated, estimates=(GOOD,)):
-    return quality_list(simulated, [0.1] * len(estimates), estimates)
+    return quality_list(simulated, [0.1] * len(estimates), estimates,
+                        pauses=pause_words(simulated.t))
 
 
 def names(items):

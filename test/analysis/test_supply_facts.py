@@ -311,6 +311,11 @@ def test_a_current_that_throttle_does_not_tell_gives_the_fall(step):
     assert ohm == pytest.approx(0.02, rel=0.1)
     assert f'lowers the rail by {ohm * found.drawn:.2f} V' in answers(found)[1]
     assert ' after 1 s' in dict(known_lines(found))['Resistance']
+    assert 'no sag over throttle is measurable' in answers(found)[1]
+    # A sag that the facts give as uncertain is not denied.
+    seen = replace(found, facts=replace(found.facts, sag=replace(
+        found.facts.sag, known=False, sag_v=(1.0,) * 11, se_v=(0.1,) * 11)))
+    assert 'lowers' in answers(seen)[1] and 'no sag' not in answers(seen)[1]
     # Of either sign; a current that charges lowers nothing.
     for sign, charge in ((-1.0, 0.0), (1.0, 60.0), (-1.0, 60.0)):
         other = overview(Recording(step * np.arange(n), v + 0.02 * charge, throttle,

@@ -158,4 +158,6 @@ def test_the_first_line_says_that_the_log_pauses(command):
         assert ('; 1 pause without usable samples, ' in subject) == bool(words)
         assert words in subject
         assert f'; {off.sum()} left out' in subject or 0.0 not in samples[1]
-        assert command is not bench.analyze or f'{samples[0].size} samples in ' in subject
+        if command is bench.analyze:
+            assert f'{samples[0].size} samples in ' in subject
+            assert ('PAUSES' in {item.name for item in found.quality}) == bool(words)
