@@ -235,6 +235,7 @@ def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: 
 def as_data(analysis: Analysis) -> dict[str, Any]:
     """Return an analysis as plain data; NaN stands for unknown."""
     recording, sliding, curves = analysis.recording, analysis.sliding, analysis.by_throttle
+    seen, line = analysis.overview, analysis.overview.line
     duration, begin = recording.duration, float(recording.t[0]) if recording.n else math.nan
     return {
         'recording': recording.name,
@@ -242,7 +243,12 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'duration_s': duration,
         'rate_hz': (recording.n - 1) / duration if duration > 0.0 else math.nan,
         'source': dict(recording.source),
-        'overview': _overview(analysis.overview),
+        'overview': {
+            'load_status': seen.load.status.name, 'level_v': seen.load.level,
+            'highest_throttle': seen.highest,
+            'strongest_line': None if line is None else {
+                'frequency_hz': line.frequency, 'rms_v': line.rms, 'share_of_variance': line.share,
+                'level': line.level, 'fundamental_hz': line.fundamental}},
         'levels': [_level(level) for level in analysis.levels],
         'process_tests': {'family_wise_error': FAMILY_WISE, 'adjusted': 'Holm',
                           'effects': {name: {'meaning': EFFECT[name], 'least': LEAST[name]}
@@ -271,17 +277,6 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
                     for item in analysis.quality],
         'craft': analysis.craft.to_dict(), 'alarms': [vars(one) for one in analysis.alarms],
         'notes': list(analysis.notes),
-    }
-
-
-def _overview(found: Overview) -> dict[str, Any]:
-    line = found.line
-    return {
-        'load_status': found.load.status.name, 'level_v': found.load.level,
-        'highest_throttle': found.highest,
-        'strongest_line': None if line is None else {
-            'frequency_hz': line.frequency, 'rms_v': line.rms, 'share_of_variance': line.share,
-            'level': line.level, 'fundamental_hz': line.fundamental},
     }
 
 

@@ -152,7 +152,9 @@ def estimate_coupling(
                      'cover were used: elsewhere a series has gaps or another rate. --from and '
                      '--to choose a part.')
     low, high = _band(band, grid)
-    length = _segment_length(grid, low)
+    # Long enough for the band to start at the third bin or later.
+    seconds = max(min(max(grid.duration / _PIECES, _SHORTEST), _LONGEST), 3.0 / low)
+    length = max(32, round(seconds * grid.rate))
     frequency, pieces = _segments(grid, length, low, high)
     for name, one in zip(series, pieces[:2]):
         if not (np.abs(one)**2).sum() > 0.0:
@@ -231,12 +233,6 @@ def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
             f'no band {low:g}..{high:g} Hz: the slower series has {min(grid.rates):.4g} Hz and is '
             f'usable up to {grid.usable:.4g} Hz')
     return low, high
-
-
-def _segment_length(grid: Grid, low: float) -> int:
-    """Return the samples per segment, enough for the band to start at the third bin or later."""
-    seconds = min(max(grid.duration / _PIECES, _SHORTEST), _LONGEST)
-    return max(32, round(max(seconds, 3.0 / low) * grid.rate))
 
 
 def _segments(grid: Grid, length: int, low: float, high: float,

@@ -134,7 +134,9 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
     z = join(apart)
     tests = [_mean_drift(parts, estimate, alpha, var_inf, noise * noise, spread),
              _variance_drift(z)]
-    local = _per_block(z)
+    # Without the mean of each block, in its standard deviations.
+    local = join([(piece - piece.mean()) / max(float(piece.std()), 1e-300)
+                  for piece in np.array_split(z, _block_count(z.size))])
     skewness, kurtosis = float(stats.skew(local)), float(stats.kurtosis(local))
     far = float(stats.norm.isf(0.5 * -math.expm1(math.log1p(-0.01) / n)))
     count = int((np.abs(local) > far).sum())
@@ -237,12 +239,6 @@ def _constant_gain(parts: Sequence[tuple[FloatArray, FloatArray]], alpha: float,
 
 def _block_count(n: int) -> int:
     return max(1, min(_BLOCKS, n // FEWEST))
-
-
-def _per_block(z: FloatArray) -> FloatArray:
-    """Return innovations, without their mean, divided by the standard deviation of their block."""
-    pieces = np.array_split(z, _block_count(z.size))
-    return join([(piece - piece.mean()) / max(float(piece.std()), 1e-300) for piece in pieces])
 
 
 def _variance_drift(z: FloatArray) -> TestResult:

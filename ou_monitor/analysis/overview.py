@@ -109,18 +109,15 @@ def overview(recording: Recording, limit: float | None = None,
     facts, load, end = facts_and_end(recording, limit, left, monitor)
     known = recording.throttle[np.isfinite(recording.throttle)]
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
+    left_out = recording.n - supplied(recording).n
+    pauses = pause_words(recording.t) + f'; {left_out} left out' * (left_out > 0)
     return Overview(facts, recording.duration if recording.n else 0.0, load,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
                     _largest(recording), _growth(recording, facts.noise, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end, _whole(levels, recording, facts.ou),
-                    beware(recording, cells), _not_there(recording), recording.n,
+                    beware(recording, cells), pauses, recording.n,
                     find_step(recording.voltage[:EXAMINED]) ** 2 / 12.0 > facts.ou.var_inf)
-
-
-def _not_there(recording: Recording) -> str:
-    left_out = recording.n - supplied(recording).n
-    return pause_words(recording.t) + f'; {left_out} left out' * (left_out > 0)
 
 
 def _growth(recording: Recording, noise: Noise, near: Sequence[int]) -> float:

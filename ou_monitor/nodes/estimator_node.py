@@ -157,7 +157,10 @@ class EstimatorNode(MonitorNode):
         if self._arrived.age == math.inf and not self._sources.problems['voltage']:
             self._console.waiting(self._voltage.topic)
         self._sources.watch()
-        self._watch_throttle()
+        # A slow source may miss three messages.
+        limit = 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
+        if self._throttle_silence.age > limit and not math.isnan(self._stream.throttle):
+            self._stream.lose_throttle()
 
     def _open(self, source: Source) -> None:
         message, spec = source.open()
@@ -250,12 +253,6 @@ class EstimatorNode(MonitorNode):
             stream.thin *= 2
         elif share < 0.25 * SHARE and stream.thin > 1:
             stream.thin //= 2
-
-    def _watch_throttle(self) -> None:
-        # A slow source may miss three messages.
-        limit = 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
-        if self._throttle_silence.age > limit and not math.isnan(self._stream.throttle):
-            self._stream.lose_throttle()
 
     def _jumped(self, reason: str) -> None:
         self._source_clock = SourceClock()

@@ -593,15 +593,11 @@ class AdaptiveNotch:
             self._sources = sources
             self._choice.decide(sources)
 
-    def _targets(self, chosen: Candidate | None) -> list[float]:
-        """Return the present frequencies of a candidate, Hz; NaN while unknown."""
-        if chosen is None or self._law is None:
-            return []
-        return [self._law.frequency(self._root)] if chosen.source == 'throttle' else self._motors
-
     def _filter_channel(self, c: int, x: float, dt: float) -> float:
         chosen = None if self._choice is None else self._choice.chosen[c]
-        wanted = self._targets(chosen)
+        # Present frequencies of the candidate, Hz; NaN while unknown.
+        wanted = [] if chosen is None or self._law is None else [
+            self._law.frequency(self._root)] if chosen.source == 'throttle' else self._motors
         bank = self._banks[c]
         if not wanted and not any(one.depth for one in bank):
             for one in bank:

@@ -334,7 +334,8 @@ class BrownoutFlag:
             return FlagLevel.UNKNOWN, 'the risk is not known'
         for level, (found, enter, words) in asks.items():
             word = level.name.lower()
-            if level in above and not self._is_delayed(level):
+            if level in above and not (self._level.value < level.value and (
+                    self._now - self._above[level] < s.brownout_delay)):
                 return level, (f'{words} (brownout.{word}: {enter:g})' if found >= enter else
                                'throttle was above the present budget for a tenth of the last '
                                '30 s')
@@ -347,11 +348,6 @@ class BrownoutFlag:
             return self._level, (f'risk {max(risk, soon):.2g} waits for brownout.delay '
                                  f'({s.brownout_delay:g} s)')
         return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'
-
-    def _is_delayed(self, level: FlagLevel) -> bool:
-        """Whether a level above the present one still has to wait for `brownout.delay`."""
-        return (self._level.value < level.value
-                and self._now - self._above[level] < self._settings.brownout_delay)
 
     def _after_hold(self, wanted: FlagLevel, reason: str, sure: bool) -> tuple[FlagLevel, str]:
         """Return the level after latch and hold."""
