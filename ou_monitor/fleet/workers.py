@@ -257,9 +257,10 @@ class ClusterWorkers(Workers):
                 if self._client.status != 'running':
                     raise InputError(f'the connection to the scheduler is lost; {_RESUME}'
                                      ) from None
-                if self._client.nthreads():
-                    alone_since = time.monotonic()
-                elif time.monotonic() - alone_since > _PATIENCE:
+                with suppress(OSError):  # The scheduler may be lost just now.
+                    if self._client.nthreads():
+                        alone_since = time.monotonic()
+                if time.monotonic() - alone_since > _PATIENCE:
                     raise InputError(f'no worker is left; {_RESUME}') from None
                 continue
             except CancelledError as error:

@@ -9,7 +9,8 @@ import threading
 import time
 
 from dask import config
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
+from distributed.comm.core import CommClosedError
 from distributed.security import Security
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.workers import ClusterWorkers
@@ -73,11 +74,22 @@ def test_no_certificate_is_one_line(scheduler):
 
 
 @pytest.mark.filterwarnings('ignore')
-def test_a_lost_scheduler_is_one_line():
-    """It goes away while a task runs; Dask's own messages on its end are no fault."""
+@pytest.mark.parametrize('asked', [False, True])
+def test_a_lost_scheduler_is_one_line(monkeypatch, asked):
+    """It goes away while a task runs, or while it is asked; Dask's own messages are no fault."""
+    begin, nthreads = time.monotonic(), Client.nthreads
+
+    def reset(client):
+        if time.monotonic() > begin + 1.0:
+            raise CommClosedError('reset by peer')
+        return nthreads(client)
+
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False,
                       protocol='tcp://', dashboard_address=None) as cluster, \
             ClusterWorkers(cluster.scheduler_address, version) as pool:
-        threading.Timer(1.0, cluster.close).start()
+        begin = time.monotonic()
+        if asked:
+            monkeypatch.setattr(Client, 'nthreads', reset)
+        threading.Timer(1.0 + asked, cluster.close).start()
         with pytest.raises(InputError, match='same command resumes'):
             list(pool.each(time.sleep, [(3.0,), (3.0,)]))
