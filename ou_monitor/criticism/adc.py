@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from ou_monitor.timeline import new_readings
+from scipy.special import xlogy
 
 # Maximum number of values used to find steps and repeats.
 EXAMINED = 200_000
@@ -25,9 +26,9 @@ _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
 # Minimum number of equal changes in `usual_change`: without ADC codes, no two changes are equal.
 _AGAIN = 20
-# Clipping: minimum samples at the limit, visits to it, and excess over neighbouring codes in
-# standard errors.
-_LEAST, _VISITS, _CLEAR = 8, 3, 5.0
+# Clipping: minimum samples at the limit, visits to it, and gain in log likelihood over the density
+# of neighbouring codes, nats: 4 standard errors, by chance in one of 16 000 recordings.
+_LEAST, _VISITS, _CLEAR = 8, 3, 8.0
 # Maximum step, in standard deviations of the noise, at which the counts of neighbouring codes
 # follow a smooth density.
 _COARSE = 2.0
@@ -138,12 +139,16 @@ def _clipping_limit(x: FloatArray, step: float) -> float:
         return math.inf
     if step > 0.0:
         # In a falling tail no code is more frequent than the codes below.
-        expected = max(float((np.abs(below - k * step) < 0.5 * step).sum()) for k in (1, 2, 3))
+        width = reach = step
+        beside = max(int((np.abs(below - k * step) < 0.5 * step).sum()) for k in (1, 2, 3))
     else:
         # Expect the same density as for the nearest samples below.
         reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
-        expected = _LEAST * 2.0 * tie / max(reach, tie)
-    return top if count - expected > _CLEAR * math.sqrt(count + expected) else math.inf
+        width, beside = max(2.0 * tie, 1e-9 * reach), _LEAST
+    expected = (count + beside) * width / (width + reach)
+    gain = count * math.log(count / expected) + float(
+        xlogy(beside, beside / (count + beside - expected)))
+    return top if count > expected and gain > _CLEAR else math.inf
 
 
 # Minimum number of repeats; probability of a tie below which the size of the changes predicts the

@@ -71,8 +71,9 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
             and (not is_response(kind) or kind.FAMILY == 'slow')
             and (throttle or not kind.NEEDS_THROTTLE)
             and (kind.ROLE is not Role.LAW or kind.CHANGES is None or kind.CHANGES in model)
-            and (kind.RECURS or all(other.NAME != kind.NAME for other in model))
-            and not any(imitate(kind, other) and not _apart(kind, other) for other in model)]
+            and (kind.RECURS or all(other.NAME != kind.NAME
+                                    and (_apart(kind, other) or not imitate(kind, other))
+                                    for other in model))]
 
 
 def _apart(one: Kind, other: Kind) -> bool:

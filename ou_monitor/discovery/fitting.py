@@ -169,12 +169,10 @@ class Fitter:
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
-            # Candidates of a law have its NAME, but another class and ROLE (`clock_jitter`).
-            starts = kind.candidates(view) if kind.ROLE is Role.LAW else None
-            if starts == () and not self._finds_events(kind, composite, view):
+            if kind.ROLE is Role.LAW and not self._finds_events(kind, composite, view):
                 gain, start = self._law_gain(kind, view), None
             else:
-                start = self.best_start(composite, kind, view, least, starts)
+                start = self.best_start(composite, kind, view, least)
                 gain = -math.inf if start is None else self.evidence(start) - before
             # Keep kinds that gain less than others: a full fit may reverse the order.
             if gain > (least if kind.BROAD else 0.0):
@@ -233,7 +231,7 @@ class Fitter:
                    starts: Sequence[Term] | None = None) -> Composite | None:
         """Return the best fit with one more term of a kind (starts: its candidates by default)."""
         # least: minimum gain of a BROAD kind in the spectrum, nats.
-        if kind.ROLE is Role.LAW and not starts:
+        if kind.ROLE is Role.LAW:
             found = self.fit([*composite.terms, kind],
                              None if _hidden_by_laws(kind, composite) else composite, rough=True)
             return found if found is not None and found.last(kind).holds(view) else None

@@ -288,17 +288,8 @@ class ClockJitter(Term):
         return effect
 
     @classmethod
-    def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a starting point for errors that are visible on the slopes of pure tones."""
-        square = np.square(np.broadcast_to(view.slope, view.z.shape)[view.train])
-        usual = float(square.mean())
-        if not float(square.std()) > 0.0:
-            return ()
-        # Score test: whether the errors are larger where the tones are steeper.
-        x, e = square - usual, np.square(view.z[view.train])
-        score = float(x @ e) / (math.sqrt(x.size) * float(x.std()) * float(e.std()))
-        std = math.sqrt(float(np.median(view.variance)) / (2.0 * usual))
-        return [JitterOnLines(min(std, 0.4 / view.rate))] if score > _STEEPER else ()
+    def variants(cls) -> Sequence[type[Term]]:
+        return (JitterOnLines,)
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
@@ -346,6 +337,20 @@ class JitterOnLines(ClockJitter):
 
     ROLE = Role.NOISE
     FREE = ('std',)
+    SLOW_FIT = False
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return a starting point if the errors are larger where pure tones are steeper."""
+        square = np.square(np.broadcast_to(view.slope, view.z.shape)[view.train])
+        usual = float(square.mean())
+        if not float(square.std()) > 0.0:
+            return ()
+        # Score test: the correlation of squared errors and squared slopes.
+        x, e = square - usual, np.square(view.z[view.train])
+        score = float(x @ e) / (math.sqrt(x.size) * float(x.std()) * float(e.std()))
+        std = math.sqrt(float(np.median(view.variance)) / (2.0 * usual))
+        return [cls(min(std, 0.4 / view.rate))] if score > _STEEPER else ()
 
     def holds(self, view: View) -> bool:
         """Return whether the errors are too small to change the order of the samples."""

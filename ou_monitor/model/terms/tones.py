@@ -12,8 +12,9 @@ from ou_monitor.model.sinusoid import fit_sinusoid
 from ou_monitor.model.spectral_lines import find_lines, Line, on_grid
 from ou_monitor.model.terms.term import (
     by_parameters, Effect, parameter, Role, Segment, Stage, Term, View)
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import FloatArray
 from scipy.signal import welch
+from scipy.special import chndtrix
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,8 @@ class Tone(Term):
         """Return the strongest lines of the residual, the first also with a wandering phase."""
         found = [cls.at(line, view) for line in lines_of(view)[:_MOST]]
         spread = math.sqrt(float(np.median(view.variance)))
-        least = _WANDERS / float(view.at[-1])
         return [*found, *(cls(0.3 * spread, line.frequency, 0.0, width) for line in found[:1]
-                          for width in (least, math.sqrt(least * SHARP * line.frequency))
-                          if width < SHARP * line.frequency)]
+                          for width in _widths(line.frequency, view))]
 
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
@@ -73,10 +72,9 @@ class Tone(Term):
         return cls(0.0, wave.frequency, 0.0, 0.0)
 
     def holds(self, view: View) -> bool:
-        """Return whether this is a line rather than ringing."""
+        """Return whether this may be a line rather than ringing."""
         return self.linewidth < SHARP * self.frequency < 0.5 * SHARP * view.rate and (
-            self.linewidth < WIDEST
-            or not power_spread(view, self.frequency, self.linewidth) > CONSTANT)
+            steady_or_ringing(view, self.frequency, self.linewidth)[0])
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
@@ -111,10 +109,16 @@ def lines_of(view: View) -> tuple[Line, ...]:
 # evidence decides later.
 _MOST, _PROPOSED = 3, 0.5
 # A fit starts from two linewidths: _WANDERS times the resolution of the recording, and the
-# geometric mean of this and the maximum.  A line wider than WIDEST, Hz, must have a constant
-# amplitude; otherwise it is ringing.
-_WANDERS, WIDEST = 3.0, 2.0
+# geometric mean of this and the maximum.
+_WANDERS = 3.0
 SHARP = 0.05  # Maximum width of a line relative to its frequency
+
+
+def _widths(frequency: float, view: View) -> list[float]:
+    """Return the linewidths, Hz, from which a fit of a narrow line starts."""
+    least = _WANDERS / float(view.at[-1])
+    return [width for width in (least, math.sqrt(least * SHARP * frequency))
+            if width < SHARP * frequency]
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,9 @@ class Resonance(Term):
         lambda term: ('frequency', 'damping', 'std', *(('tilt',) if term.tilt else ())))
     SLOW_FIT = True
     SIGNS = ('line', '+band', 'autocorrelation')
-    SEARCH = 5.0
+    IMITATES = ('tone',)
+    # Few broad peaks are distinct, but as many narrow ones as of a `tone`.
+    SEARCH = by_parameters(5.0, lambda term: Tone.SEARCH if term.is_narrow() else 5.0)
     STATES = 2
     SEVERAL = True
     RECURS = True
@@ -189,11 +195,13 @@ class Resonance(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return starting points at the broad peaks of the residual."""
+        """Return starting points at the broad peaks of the residual, and at its strongest line."""
         spread = float(np.sqrt(np.median(view.variance)))
-        return [cls(frequency, width, 0.5 * spread, tilt)
-                for frequency, width in broad_peaks(view.z[view.train], view.rate)
-                for tilt in (0.0, -_STEEP, _STEEP)]
+        return [*(cls(frequency, width, 0.5 * spread, tilt)
+                  for frequency, width in broad_peaks(view.z[view.train], view.rate)
+                  for tilt in (0.0, -_STEEP, _STEEP)),
+                *(cls(line.frequency, math.pi * width, 0.2 * spread, 0.0)
+                  for line in lines_of(view)[:1] for width in _widths(line.frequency, view))]
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
@@ -201,11 +209,15 @@ class Resonance(Term):
                         self.tilt * self.damping / (2.0 * math.pi * self.frequency))
 
     def holds(self, view: View) -> bool:
-        """Return whether this oscillates, and decays faster than a line."""
-        width = self.damping / math.pi
+        """Return whether this oscillates, and may be ringing rather than a line."""
         # It is ringing if its line is too wide for a tone, or if its amplitude varies.
-        return width < 2.0 * self.frequency < view.rate and (width >= SHARP * self.frequency or (
-            width > WIDEST and not power_spread(view, self.frequency, width) < RINGING))
+        width = self.damping / math.pi
+        return width < 2.0 * self.frequency < view.rate and (
+            not self.is_narrow() or steady_or_ringing(view, self.frequency, width)[1])
+
+    def is_narrow(self) -> bool:
+        """Return whether the line is as narrow as a tone may be."""
+        return self.damping < math.pi * SHARP * self.frequency
 
 
 # Initial and maximum |tilt|: at 1, a step would add no noise to one of the states.
@@ -323,29 +335,40 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     return f, q, np.array([1.0, 0.0])
 
 
-# `power_spread`: number of segments per 1 / linewidth, and minimum number of segments.
-_FINE, _ENOUGH = 4.0, 12
-# Limits of `power_spread`.  Above CONSTANT, a peak is not a line of constant amplitude; below
-# RINGING, it is not ringing.  Between 0.7 and 0.85 it can be either, and the evidence decides.
-# Of 60 lines and 60 ringings, simulated with outliers:
-# 14 segments: 60 lines and 10 ringings below CONSTANT, 2 lines and 54 ringings above RINGING;
-# 33 segments: 60 lines and 2 ringings below CONSTANT, 0 lines and 60 ringings above RINGING.
-CONSTANT, RINGING = 0.85, 0.7
+# `steady_or_ringing`: segments per 1 / linewidth, minimum number of segments, and distances, in
+# segments, of neighbouring frequencies.
+_FINE, _ENOUGH, _ASIDE = 4.0, 12, (-6.0, -5.0, -4.0, 4.0, 5.0, 6.0)
+# Interquartile range / median of powers that are exponentially distributed, as of ringing; its
+# standard error, times the root of the number of segments, in simulations of lines and ringing
+# 0.3 to 2 Hz wide with white noise; and the number of standard errors that excludes one of both.
+_EXPONENTIAL, _SPREADS, _CLEARLY = math.log(3.0) / math.log(2.0), 2.0, 2.0
 
 
-def power_spread(view: View, frequency: float, linewidth: float) -> float:
-    """Return interquartile range / median of a line's powers in segments (arguments in Hz)."""
-    # 0 for a line of constant amplitude; ln 3 / ln 2 = 1.58 for ringing driven by noise, whose
-    # powers are exponentially distributed; NaN with too few segments.  Outliers hardly matter.
+def steady_or_ringing(view: View, frequency: float, linewidth: float) -> tuple[bool, bool]:
+    """Return whether a line may have a constant amplitude, and that of ringing (Hz)."""
+    # The powers of segments are compared with those of a constant amplitude in noise (noncentral
+    # chi-square) and of ringing.  A weak line may be either; in few segments it counts as a line.
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
-    v, at = view.residual, view.at
-    count = v.size // max(length, 1)
+    count = view.residual.size // max(length, 1)
     if count < _ENOUGH or length * frequency < _FINE * view.rate:
-        return NAN
-    turned = (v - v.mean()) * np.exp(-2j * math.pi * (frequency * at % 1.0))
-    power = np.abs(turned[:count * length].reshape(count, length) @ np.hanning(length)) ** 2
+        return True, False
+    size = count * length
+    v, at = (view.residual - view.residual.mean())[:size], view.at[:size]
+
+    def powers(centre: float) -> FloatArray:
+        turned = v * np.exp(-2j * math.pi * (centre * at % 1.0))
+        return np.asarray(np.abs(turned.reshape(count, length) @ np.hanning(length)) ** 2)
+
+    power = powers(frequency)
+    noise = float(np.median([powers(frequency + k * view.rate / length) for k in _ASIDE]))
     low, middle, high = np.percentile(power, [25.0, 50.0, 75.0]).tolist()
-    return float((high - low) / middle) if middle > 0.0 else NAN
+    if not noise > 0.0 or not middle > 0.0:
+        return True, False
+    ratio = max(0.0, float(power.mean()) * math.log(2.0) / noise - 1.0)
+    first, second, third = chndtrix([0.25, 0.5, 0.75], 2.0, 2.0 * ratio).tolist()
+    steady, found = (third - first) / second, (high - low) / middle
+    room, midway = _CLEARLY * _SPREADS / math.sqrt(count), 0.5 * (_EXPONENTIAL + steady)
+    return found < max(steady + room, midway), found > min(_EXPONENTIAL - room, midway)
 
 
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
