@@ -12,6 +12,7 @@ from ou_monitor.model.terms.term import (
     climb, curvature_se, Effect, LawFit, log_normal, mixture_cdf, normal_scores, parameter, Role,
     Segment, Stage, Term, View)
 from ou_monitor.records import FloatArray
+from scipy.special import ndtr
 
 
 @dataclass(frozen=True)
@@ -107,11 +108,10 @@ class LopsidedNoise(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit the scores, if they are mostly white noise; their scale is free."""
-        white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
+        """Fit the scores, if the white noise makes them asymmetric; their scale is free."""
         found, paid = cls._best_fit(view)
         # Other causes describe heavy tails without asymmetry.
-        return found if float(white.mean()) > _MOSTLY and paid else None
+        return found if paid and _of_readings(view) else None
 
     def refit_law(self, view: View) -> LawFit:
         """Fit again, without the conditions of `fit_law`: evidence decides if the cause stays."""
@@ -121,6 +121,7 @@ class LopsidedNoise(Term):
     def _best_fit(cls, view: View) -> tuple[LawFit, bool]:
         """Return the fit, and whether the asymmetry gains more than the penalty of a parameter."""
         z = view.z
+        white = max(_LEAST, 1.0 - float(np.median(view.trust)))
         edges = np.unique(np.quantile(z[view.train], np.linspace(0.0, 1.0, _CELLS + 1)))
         cells = np.clip(np.searchsorted(edges, z[view.train]) - 1, 0, edges.size - 2)
         count = np.bincount(cells, minlength=edges.size - 1)
@@ -129,20 +130,33 @@ class LopsidedNoise(Term):
         centre = np.bincount(cells, z[view.train], edges.size - 1)[some] / count
 
         def value(x: FloatArray) -> float:
-            return float(count @ _lopsided_scores(centre, *x)[1])
+            return float(count @ _lopsided_scores(centre, white, *x)[1])
 
         skewed = float(np.sign(np.mean(z[view.train] ** 3)))
         x, most = climb(value, [0.1 * skewed, -0.1, 0.0], 0.2)
         even = climb(lambda x: value(np.array([0.0, *x])), x[1:], 0.2)[1]
-        scores, gain = _lopsided_scores(z, *x)
+        scores, gain, rest = _lopsided_scores(z, white, *x)
         se = curvature_se(value, x)
         tail = math.exp(x[1])
+        # With this variance of an error, the next fit moves its state by the mean of `rest`.
+        ratio = np.divide(rest, (1.0 - white) * z, out=np.ones(z.size), where=np.abs(z) > 1.0)
         fit = LawFit(cls(float(x[0]), tail), {'skew': float(se[0]), 'tail': tail * float(se[1])},
-                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3)
+                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3,
+                     error=view.variance * (1.0 / np.clip(ratio, _LEAST, 1.0) - 1.0))
         return fit, most - even > 0.5 * math.log(z[view.train].size)
 
 
-_MOSTLY = 0.5  # Minimum share of white noise in the one-step errors
+def _of_readings(view: View) -> bool:
+    """Return whether white noise, not the drive, causes most of the third moment of the scores."""
+    # After an error of a reading, the next one has the opposite sign, times the gain of the
+    # filter; after an excursion of the drive, it has the same sign, times the rest of the gain.
+    z, phi, gain = (np.broadcast_to(each, view.z.shape)[view.train]
+                    for each in (view.z, view.phi, view.trust))
+    third = float(np.mean(z ** 3))
+    after = float(np.mean(z[:-1] ** 2 * z[1:])) / third if third else 0.0
+    return after < float(np.median(phi)) * (0.5 - float(np.median(gain)))
+
+
 _CELLS = 400  # Number of bins of scores in a fit
 _FARTHEST = 8.0  # Limit at which scores are clipped
 # Points and weights for expectations over a normal distribution.
@@ -161,18 +175,30 @@ def _moments(skew: float, tail: float) -> tuple[float, float]:
     return mean, math.sqrt(float(weights @ (values - mean) ** 2))
 
 
-def _lopsided_scores(z: FloatArray, skew: float, log_tail: float, log_scale: float
-                     ) -> tuple[FloatArray, FloatArray]:
-    """Return normal scores under the law, and gains in log density, nats."""
+def _lopsided_scores(z: FloatArray, white: float, skew: float, log_tail: float, log_scale: float
+                     ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return normal scores under the law, gains in log density, nats, and means of the rest."""
+    # A score is the sum of white noise, a share `white` of its variance, and a normal rest.
     tail = math.exp(min(max(log_tail, -1.5), 1.5))
     skew = min(max(skew, -3.0), 3.0)
     mean, std = _moments(skew, tail)
-    unit = std * math.exp(-log_scale)
-    y = mean + unit * z
-    wide = tail * np.arcsinh(y) - skew
-    scores = np.sinh(wide)
-    slope = np.log(np.cosh(wide)) + math.log(tail * unit) - 0.5 * np.log1p(y * y)
-    return scores, slope - 0.5 * scores * scores + 0.5 * z * z
+    unit = std * math.exp(-log_scale) / math.sqrt(white)
+    chance, density, means = np.zeros(z.size), np.full(z.size, _TINY), np.zeros(z.size)
+    for rest, weight in zip(math.sqrt(1.0 - white) * _REST[0], _REST[1], strict=True):
+        y = mean + unit * (z - rest)
+        wide = tail * np.arcsinh(y) - skew
+        scores = np.sinh(wide)
+        chance += weight * ndtr(scores)
+        part = weight * np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(1.0, y)
+        density += part
+        means += part * rest
+    return normal_scores(chance), np.log(density * tail * unit) + 0.5 * z * z, means / density
+
+
+# Points and weights of the normal rest; minimum density.
+_REST = tuple(part / scale for part, scale in zip(
+    np.polynomial.hermite_e.hermegauss(12), (1.0, math.sqrt(2.0 * math.pi)), strict=True))
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
