@@ -135,14 +135,11 @@ class LopsidedNoise(Term):
         skewed = float(np.sign(np.mean(z[view.train] ** 3)))
         x, most = climb(value, [0.1 * skewed, -0.1, 0.0], 0.2)
         even = climb(lambda x: value(np.array([0.0, *x])), x[1:], 0.2)[1]
-        scores, gain, rest = _lopsided_scores(z, white, *x)
+        scores, gain = _lopsided_scores(z, white, *x)
         se = curvature_se(value, x)
         tail = math.exp(x[1])
-        # With this variance of an error, the next fit moves its state by the mean of `rest`.
-        ratio = np.divide(rest, (1.0 - white) * z, out=np.ones(z.size), where=np.abs(z) > 1.0)
         fit = LawFit(cls(float(x[0]), tail), {'skew': float(se[0]), 'tail': tail * float(se[1])},
-                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3,
-                     error=view.variance * (1.0 / np.clip(ratio, _LEAST, 1.0) - 1.0))
+                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3)
         return fit, most - even > 0.5 * math.log(z[view.train].size)
 
 
@@ -176,23 +173,21 @@ def _moments(skew: float, tail: float) -> tuple[float, float]:
 
 
 def _lopsided_scores(z: FloatArray, white: float, skew: float, log_tail: float, log_scale: float
-                     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return normal scores under the law, gains in log density, nats, and means of the rest."""
+                     ) -> tuple[FloatArray, FloatArray]:
+    """Return normal scores under the law, and gains in log density, nats."""
     # A score is the sum of white noise, a share `white` of its variance, and a normal rest.
     tail = math.exp(min(max(log_tail, -1.5), 1.5))
     skew = min(max(skew, -3.0), 3.0)
     mean, std = _moments(skew, tail)
     unit = std * math.exp(-log_scale) / math.sqrt(white)
-    chance, density, means = np.zeros(z.size), np.full(z.size, _TINY), np.zeros(z.size)
+    chance, density = np.zeros(z.size), np.full(z.size, _TINY)
     for rest, weight in zip(math.sqrt(1.0 - white) * _REST[0], _REST[1], strict=True):
         y = mean + unit * (z - rest)
         wide = tail * np.arcsinh(y) - skew
         scores = np.sinh(wide)
         chance += weight * ndtr(scores)
-        part = weight * np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(1.0, y)
-        density += part
-        means += part * rest
-    return normal_scores(chance), np.log(density * tail * unit) + 0.5 * z * z, means / density
+        density += weight * np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(1.0, y)
+    return normal_scores(chance), np.log(density * tail * unit) + 0.5 * z * z
 
 
 # Points and weights of the normal rest; minimum density.

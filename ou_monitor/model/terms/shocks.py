@@ -73,6 +73,10 @@ class Jumps(Term):
 
         return effect
 
+    def holds(self, view: View) -> bool:
+        """Return whether jumps are rare."""
+        return self.rate <= _OFTEN * view.rate
+
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a mixture to the scores: most are normal, and some contain a jump."""
@@ -185,6 +189,10 @@ class Glitches(Term):
             s.voltage[bad] += self.std * sizes.standard_normal(int(bad.sum()))
 
         return effect
+
+    def holds(self, view: View) -> bool:
+        """Return whether bad samples are rare."""
+        return self.probability <= _OFTEN
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
