@@ -75,7 +75,7 @@ class Jumps(Term):
 
     def holds(self, view: View) -> bool:
         """Return whether jumps are rare."""
-        return self.rate <= _OFTEN * view.rate
+        return self.rate <= 2.0 * _OFTEN * view.rate
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
@@ -126,7 +126,7 @@ def _parts(z: FloatArray, var: FloatArray, share: float, mean: float, spread: fl
     return calm, jump
 
 
-def _mixture(z: FloatArray, var: FloatArray, centred: bool
+def _mixture(z: FloatArray, var: FloatArray, centred: bool = False
              ) -> tuple[float, float, float, float] | None:
     """Return share, mean and std (V) of the events, and the scale of the noise, by EM."""
     # centred: the mean is 0.
@@ -192,7 +192,7 @@ class Glitches(Term):
 
     def holds(self, view: View) -> bool:
         """Return whether bad samples are rare."""
-        return self.probability <= _OFTEN
+        return self.probability <= 2.0 * _OFTEN
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
