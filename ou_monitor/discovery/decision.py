@@ -43,8 +43,9 @@ CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
 # Total filter time after which kinds whose fit takes seconds are no longer tried, s; twice as long
-# for BROAD kinds, because a spectrum shows beforehand whether they gain, and without them a slow
-# residual of the response to throttle can halve the fitted alpha.
+# for laws, which need no filter, and for BROAD kinds, because a spectrum shows beforehand whether
+# they gain, and without them a slow residual of the response to throttle can halve the fitted
+# alpha.
 MOST_COST = 10.0
 # Limit of a statistic: by theory, any of 70 exceeds it by chance in 1 of 2300 recordings; in
 # simulations, in 3 of 8700.
@@ -101,7 +102,7 @@ def _shows(kind: Kind, name: str, value: float) -> bool:
 
 def affordable(kind: Kind, cost: float) -> bool:
     """Return whether the search may still try a kind after fits of this cost (s)."""
-    return cost <= MOST_COST * (1.0 + kind.BROAD) or not kind.SLOW_FIT
+    return cost <= MOST_COST * (1.0 + (kind.BROAD or kind.ROLE is Role.LAW)) or not kind.SLOW_FIT
 
 
 # -- acceptance of trials

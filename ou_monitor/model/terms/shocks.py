@@ -524,7 +524,7 @@ class Volatility(Term):
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
     def holds(self, view: View) -> bool:
-        """Return whether sigma neither has a trend nor forgets within a few samples."""
+        """Return whether sigma neither has a trend nor is drawn anew at nearly every sample."""
         return _WANDERS / float(view.at[-1]) < self.rate < _FORGETS * view.rate
 
     @classmethod
@@ -618,11 +618,9 @@ _EVERY = 4  # Number of segments between normalisations, which prevent underflow
 # Minimum number of relaxation times of ln sigma in a recording: with 2, the standard error of the
 # logarithm of its variance is sqrt(2/2) = 1.
 _WANDERS = 2.0
-# Maximum rate of ln sigma, relative to the sampling rate.  Outliers of the drive or of single
-# readings affect the next errors too, which imitates a fast rate: it was above 0.2 in 44 of 45
-# simulated rails with independent outliers in which the evidence was for both laws, and below in
-# 24 of 24 in which ln sigma wandered at up to 0.3.
-_FORGETS = 0.2
+# Maximum rate of ln sigma, in samples per second: its neighbouring values correlate by one half.
+# With less, sigma is drawn anew at each sample, which is another law (heavy tails).
+_FORGETS = math.log(2.0)
 # Stationary probabilities of the levels.
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
 # Range of ln std, ln rate (1/s) and mean of ln sigma.
