@@ -205,17 +205,16 @@ class Glitches(Term):
     @classmethod
     def _best_fit(cls, view: View, most: float) -> LawFit | None:
         """Return the better fit; a mixture only if the share of errors is at most `most`."""
-        runs, mixed = cls.fit_runs(view), cls._fit_mixture(view)
-        found = [fit for fit in (runs, mixed if mixed and mixed.term.probability <= most else None)
+        found = [fit for fit in (cls.fit_runs(view), cls._fit_mixture(view, most))
                  if fit is not None]
         return max(found, default=None, key=lambda fit: float(
             fit.gain[view.train].sum()) - 0.5 * fit.free * math.log(view.train.stop))
 
     @classmethod
-    def _fit_mixture(cls, view: View) -> LawFit | None:
+    def _fit_mixture(cls, view: View, most: float) -> LawFit | None:
         """Fit a mixture to the scores: most are normal, and some contain an error."""
         found = _rare_events(view, centred=True)
-        if found is None:
+        if found is None or found[0] > most:
             return None
         share, _, spread, bad, scores, gain = found
         count = max(share * view.train.stop, 1.0)
