@@ -201,7 +201,8 @@ class Resonance(Term):
                   for frequency, width in broad_peaks(view.z[view.train], view.rate)
                   for tilt in (0.0, -_STEEP, _STEEP)),
                 *(cls(line.frequency, math.pi * width, 0.2 * spread, 0.0)
-                  for line in lines_of(view)[:1] for width in _widths(line.frequency, view))]
+                  for line in lines_of(view)[:1] for width in _widths(line.frequency, view)
+                  if steady_or_ringing(view, line.frequency, width)[1])]
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
