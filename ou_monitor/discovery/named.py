@@ -77,12 +77,11 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         fitter, search = loaded or under_load(samples, start)
         begun = found = _fit_everything(fitter, search, bank)
         for turn in range(_TURNS):
-            less = search.copy()
             # In the last turn, name no latent causes: those named were withdrawn repeatedly.
-            name_causes(fitter, search, bank, given=[*given, *dropped],
-                        latent=turn < _TURNS - 1,
+            less, latent = search.copy(), turn < _TURNS - 1
+            name_causes(fitter, search, bank, given=[*given, *dropped], latent=latent,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
-            if fitter.evidence(search.composite) < refuted:
+            if latent and fitter.evidence(search.composite) < refuted:
                 # These causes are worse than the withdrawn ones that they replace.
                 search = less
             found = _fit_everything(fitter, search, bank)

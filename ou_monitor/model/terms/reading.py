@@ -135,6 +135,7 @@ class LopsidedNoise(Term):
         skewed = float(np.sign(np.mean(z[view.train] ** 3)))
         x, most = climb(value, [0.1 * skewed, -0.1, 0.0], 0.2)
         even = climb(lambda x: value(np.array([0.0, *x])), x[1:], 0.2)[1]
+        x = np.clip(x, *_RANGE)
         scores, gain = _lopsided_scores(z, white, *x)
         se = curvature_se(value, x)
         tail = math.exp(x[1])
@@ -155,6 +156,8 @@ def _of_readings(view: View) -> bool:
 
 
 _CELLS = 400  # Number of bins of scores in a fit
+# Range of skew, ln tail and ln scale.
+_RANGE = np.array([[-3.0, -1.5, -math.inf], [3.0, 1.5, math.inf]])
 _FARTHEST = 8.0  # Limit at which scores are clipped
 # Points and weights for expectations over a normal distribution.
 _NORMAL = np.polynomial.hermite_e.hermegauss(80)
@@ -176,8 +179,8 @@ def _lopsided_scores(z: FloatArray, white: float, skew: float, log_tail: float, 
                      ) -> tuple[FloatArray, FloatArray]:
     """Return normal scores under the law, and gains in log density, nats."""
     # A score is the sum of white noise, a share `white` of its variance, and a normal rest.
-    tail = math.exp(min(max(log_tail, -1.5), 1.5))
-    skew = min(max(skew, -3.0), 3.0)
+    skew, log_tail, log_scale = np.clip((skew, log_tail, log_scale), *_RANGE).tolist()
+    tail = math.exp(log_tail)
     mean, std = _moments(skew, tail)
     unit = std * math.exp(-log_scale) / math.sqrt(white)
     chance, density = np.zeros(z.size), np.full(z.size, _TINY)
