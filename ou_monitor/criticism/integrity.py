@@ -139,9 +139,10 @@ def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> 
 
 # Scatter of stamps about a grid, as a share of a step: below `_SMALL` it is ignored, above
 # `_LARGE` there is no grid.
-_SMALL, _LARGE = 0.02, 0.45
-# Correlation of neighbouring errors up to which they count as independent.
-_WHITE = 0.3
+_SMALL, _LARGE = 0.02, 1.0
+# Correlation of neighbouring errors from which they are the wander of a clock: in a queue, late
+# stamps have 0.6.
+_WHITE = 0.8
 _TINY = 1e-6  # Scatter that counts as zero, in steps
 
 
@@ -151,12 +152,11 @@ def judge_stamps(t: FloatArray, voltage: FloatArray, notes: list[str]
     # error: standard deviation of wrong stamps, s; 0 if stamps are right.
     step = np.diff(t)
     usual = float(np.median(step))
-    # First assume no gaps, because steps that scatter by half their length look like gaps.
-    number = np.ones(step.size)
-    grid = on_grid(t, number)
-    if float((t - grid).std()) > _LARGE * usual:
-        number = np.maximum(1.0, np.rint(step / usual))
-        grid = on_grid(t, number)
+    # Late stamps look like gaps, but those after them are not late: the nearer grid is right.
+    number, gapped = np.ones(step.size), np.maximum(1.0, np.rint(step / usual))
+    grid, other = on_grid(t, number), on_grid(t, gapped)
+    if float((t - other).std()) < float((t - grid).std()):
+        number, grid = gapped, other
     gaps = int((number > 1.0).sum())
     if gaps:
         notes.append(f'{counted(gaps, "gap")} in the stamps, the longest '

@@ -170,7 +170,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
             float(part.sum()) for part in np.array_split(
                 trial.composite.density - search.composite.density, BLOCKS)], Z95)]
         if first and steady:
-            return steady
+            return sorted(steady, key=lambda trial: -trial.evidence)
     trials.sort(key=lambda trial: -trial.evidence)
     # In a tie, measured causes come first (a trend counts as measured, because time is).
     return sorted(trials, key=lambda trial: not (

@@ -122,6 +122,26 @@ def test_wrong_stamps_differ_from_uneven_sampling():
     assert error == 0.0 and np.array_equal(used, stamps)
 
 
+@pytest.mark.parametrize('queue', [False, True])
+def test_late_stamps_are_no_gaps(queue):
+    """Delays of half a step on average, at times of more than one; in a queue, none overtakes."""
+    rng = np.random.default_rng(9)
+    t, v = rail(9)
+    late = rng.exponential(0.5 / RATE, t.size) * (rng.random(t.size) < 0.2 if queue else 1.0)
+    stamps = np.maximum.accumulate(t + (2.0 if queue else 1.0) * late)
+    stamps += 1e-3 / RATE * np.arange(t.size) / t.size
+    notes = []
+    used, error = judge_stamps(stamps, v, notes)
+    assert error == pytest.approx((stamps - used).std(), rel=0.01)
+    # The grid is that of the mean delay.
+    assert np.ptp(used - t) < 0.1 / RATE
+    assert not any('gap' in note for note in notes)
+    # With lost samples, and stamps in time, there are gaps.
+    kept = rng.random(t.size) < 0.99
+    judge_stamps(t[kept], v[kept], notes)
+    assert any('gap' in note for note in notes)
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_short_recording_tells_wrong_stamps_by_their_likelihood(seed):
     """3000 samples, a tenth of a step: the slope is known to 0.2, and 0 and 1 lie apart."""

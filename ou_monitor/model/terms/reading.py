@@ -374,7 +374,7 @@ class JitterOnLines(ClockJitter):
         x, e = square - usual, np.square(view.z[view.train])
         score = float(x @ e) / (math.sqrt(x.size) * float(x.std()) * float(e.std()))
         std = math.sqrt(float(np.median(view.variance)) / (2.0 * usual))
-        return [cls(min(std, 0.4 / view.rate))] if score > _STEEPER else ()
+        return [cls(min(std, 0.4 / view.rate))] if score > 0.0 else ()
 
     def holds(self, view: View) -> bool:
         """Return whether the errors are too small to change the order of the samples."""
@@ -385,9 +385,6 @@ class JitterOnLines(ClockJitter):
 
 
 _MOST_ERROR = 0.45  # Maximum standard deviation of the errors of stamps, in steps
-# Minimum score for a fit of errors on tones, in standard errors: half of its square is 6 nats (a
-# cause needs 4 after its penalties).
-_STEEPER = 3.5
 
 
 def _square_correlation(square: FloatArray) -> float:
