@@ -61,6 +61,17 @@ def test_bad_samples_are_named_although_they_are_most_of_the_variance(share, siz
     assert set(names) - {'measurement_noise'} == {'glitches'}
 
 
+def test_errors_of_readings_hardly_larger_than_the_noise_are_named():
+    """One in fifty, of two errors of a step; on average 80 nats, 40 at least in nine of ten."""
+    t = np.arange(10_000) / 200.0
+    model = SupplyModel((OU(46.0, 0.07, 4.0), MeasurementNoise(0.0033), Glitches(0.02, 0.0106)))
+    named = [{cause.name for cause in discover(
+        Recording(t, model.simulate(t, np.random.default_rng(seed)), None)).causes}
+             for seed in range(4)]
+    assert sum('glitches' in one for one in named) >= 3
+    assert not any('volatility' in one for one in named)
+
+
 def test_a_lagged_sag_under_jittering_throttle_is_found():
     """Throttle trembles: a sag at once explains nothing, and neither does a lag without it."""
     rng, n, rate = np.random.default_rng(2), 30000, 1000.0

@@ -9,6 +9,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise, Quantization
 from ou_monitor.records import Recording
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import skew
 
 RAIL, STD = OU(1.0, 0.01, 12.0), 0.05
@@ -46,6 +47,21 @@ def test_noise_of_another_asymmetric_law_is_named_and_something_left():
     assert 'lopsided_noise' in [cause.name for cause in found.causes]
     (skewness,) = (c for c in found.record.criticism if c.statistic == 'skewness')
     assert abs(skewness.after) < 0.3 * abs(skewness.before)
+
+
+@pytest.mark.parametrize('of_rail', [False, True])
+def test_less_than_half_of_the_noise_is_named_and_an_asymmetric_drive_is_not(of_rail):
+    """White noise is two fifths of the one-step variance; or else the drive is asymmetric."""
+    named = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        falls = (2.0 - rng.gamma(2.0, size=N)) / np.sqrt(2.0)
+        even = rng.standard_normal(N)
+        kicks, white = (falls, even) if of_rail else (even, falls)
+        rail = lfilter([0.05], [1.0, -0.9], kicks)
+        found = discover(Recording(T, 12.0 + rail + 0.05 * white))
+        named.append('lopsided_noise' in {c.name for c in found.causes})
+    assert sum(named) == (0 if of_rail else 3)
 
 
 def test_even_tails_are_not_called_lopsided():
