@@ -136,7 +136,8 @@ class LopsidedNoise(Term):
         x, most = climb(value, [0.1 * skewed, -0.1, 0.0], 0.2)
         even = climb(lambda x: value(np.array([0.0, *x])), x[1:], 0.2)[1]
         x = np.clip(x, *_RANGE)
-        scores, gain = _lopsided_scores(z, white, *x)
+        each, gain = _lopsided_scores(z, white, *x)
+        scores = normal_scores(_REST[1] @ ndtr(each))
         se = curvature_se(value, x)
         tail = math.exp(x[1])
         fit = LawFit(cls(float(x[0]), tail), {'skew': float(se[0]), 'tail': tail * float(se[1])},
@@ -177,20 +178,17 @@ def _moments(skew: float, tail: float) -> tuple[float, float]:
 
 def _lopsided_scores(z: FloatArray, white: float, skew: float, log_tail: float, log_scale: float
                      ) -> tuple[FloatArray, FloatArray]:
-    """Return normal scores under the law, and gains in log density, nats."""
+    """Return normal scores of the law by point of the rest, and gains in log density, nats."""
     # A score is the sum of white noise, a share `white` of its variance, and a normal rest.
     skew, log_tail, log_scale = np.clip((skew, log_tail, log_scale), *_RANGE).tolist()
     tail = math.exp(log_tail)
     mean, std = _moments(skew, tail)
     unit = std * math.exp(-log_scale) / math.sqrt(white)
-    chance, density = np.zeros(z.size), np.full(z.size, _TINY)
-    for rest, weight in zip(math.sqrt(1.0 - white) * _REST[0], _REST[1], strict=True):
-        y = mean + unit * (z - rest)
-        wide = tail * np.arcsinh(y) - skew
-        scores = np.sinh(wide)
-        chance += weight * ndtr(scores)
-        density += weight * np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(1.0, y)
-    return normal_scores(chance), np.log(density * tail * unit) + 0.5 * z * z
+    y = mean + unit * (z - math.sqrt(1.0 - white) * _REST[0][:, None])
+    wide = tail * np.arcsinh(y) - skew
+    scores = np.sinh(wide)
+    density = _REST[1] @ (np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(1.0, y))
+    return scores, np.log((density + _TINY) * tail * unit) + 0.5 * z * z
 
 
 # Points and weights of the normal rest; minimum density.
