@@ -484,6 +484,12 @@ def plausible_stamps(name: str, t: FloatArray) -> FloatArray:
     return found
 
 
+def like_throttle(voltage: FloatArray) -> bool:
+    """Return whether a voltage, V, stays within 0 to 1; of an AC-coupled one, half is below 0."""
+    low, high = float(np.nanmin(voltage, initial=0.0)), float(np.nanmax(voltage, initial=0.0))
+    return low >= 0.0 and high <= 1.0
+
+
 def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
     """Refuse a throttle in percent, microseconds or counts, or swapped with the voltage."""
     if plausible(throttle, MOST_THROTTLE) is throttle:
@@ -492,8 +498,7 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
     # A few wild values are errors, not another unit: they become NaN, here as in the node.
     if float(np.count_nonzero(np.abs(known) > MOST_THROTTLE)) <= WILD * known.size:
         return
-    if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
-            and float(np.median(known)) < 100.0:
+    if voltage is not None and like_throttle(voltage) and float(np.median(known)) < 100.0:
         raise InputError(
             f'{name}: the voltage stays within 0 to 1 and throttle runs from '
             f'{known.min():g} to {known.max():g}: are the two columns swapped?')

@@ -156,6 +156,20 @@ def test_swapped_columns_and_odd_times_are_reported(tmp_path):
     np.testing.assert_allclose(t, times, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize('middle, swapped', [(0.5, True), (0.0, False)])
+def test_an_ac_coupled_voltage_is_no_throttle(tmp_path, middle, swapped):
+    """Beside throttle in percent: volts within 0 to 1 may be swapped with it, others not."""
+    rng = np.random.default_rng(1)
+    path = written(tmp_path, 'time_s,voltage_v,throttle\n' + ''.join(
+        f'{0.01 * k:.2f},{middle + 0.1 * x:.5f},{30.0 + 20.0 * y:.1f}\n'
+        for k, (x, y) in enumerate(rng.uniform(-1.0, 1.0, (200, 2)).tolist())))
+    if swapped:
+        with pytest.raises(InputError, match='stays within 0 to 1 and throttle runs from'):
+            read_recording(path)
+    else:
+        assert 0.1 <= read_recording(path).throttle.min() < 0.15
+
+
 @pytest.mark.parametrize('columns', [
     {'voltage': 'time_s'}, {'throttle': 'time_s'}, {'current': 'voltage_v'},
     {'throttle': 'voltage_v'}, {'time': 'voltage_v'}, {'time': 'throttle', 'throttle': 'throttle'},

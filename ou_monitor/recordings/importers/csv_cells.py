@@ -23,7 +23,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.records import clock_unit, FloatArray, LONGEST_STEP, TIME_UNITS
 from ou_monitor.text import plain_number
-from ou_monitor.timeline import MOST_THROTTLE, Picked, WILD
+from ou_monitor.timeline import like_throttle, MOST_THROTTLE, Picked, WILD
 
 # Words of loggers for a missing number, or for one beyond the range.
 _MISSING = frozenset('nan,null,none,na,n/a,#n/a,x,∞,-∞,ol,-ol,ovl,overload,'
@@ -411,7 +411,7 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
         return '1:2'
     beyond = known[known > MOST_THROTTLE]
     # If the voltage is within 0 to 1, the columns may be swapped: `check_throttle` reports it.
-    if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
+    if beyond.size <= WILD * known.size or like_throttle(volts):
         return '1'
     if high <= 110.0:
         return '%' if high > _LEAST_PERCENT else '1'
