@@ -140,8 +140,8 @@ def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> 
 # Scatter of stamps about a grid, as a share of a step: below `_SMALL` it is ignored, above
 # `_LARGE` there is no grid.
 _SMALL, _LARGE = 0.02, 1.0
-# Correlation of neighbouring errors from which they are the wander of a clock: in a queue, late
-# stamps have 0.6.
+# Correlation of neighbouring errors from which they are the wander of a clock: late stamps of a
+# simulated queue have 0.6.
 _WHITE = 0.8
 _TINY = 1e-6  # Scatter that counts as zero, in steps
 

@@ -299,7 +299,7 @@ class Term:
     # causes.
     MEASURED: ClassVar[bool] = False
     # Causes that are hard to distinguish from this one: the search does not add one of such a pair
-    # to the other.  It suffices that one of the two classes names the other.
+    # to the other, unless it RECURS.  It suffices that one of the two classes names the other.
     IMITATES: ClassVar[tuple[str, ...]] = ()
     # Whether the law finds single events.  It is fitted before the other laws, which would absorb
     # them, and may be added to one that it imitates.

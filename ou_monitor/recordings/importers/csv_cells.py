@@ -254,7 +254,7 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Number of values of a 32-bit counter.
 _COUNTS = 2.0**32
-# Maximum voltage of a pack, V. Without a unit, larger values are mV, or uV (as Linux reports) if$
+# Maximum voltage of a pack, V. Without a unit, larger values are mV, or uV (as Linux reports) if
 # too large for that; whole numbers down to a tenth of it may be ADC counts, and are refused.
 MOST_VOLTS = 1000.0
 # Peak above which a throttle without a unit is percent, not a lever's voltage of up to 5 V.
