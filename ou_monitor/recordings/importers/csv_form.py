@@ -553,14 +553,11 @@ def holds_clocks(form: Form, place: int) -> bool:
 
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None,
-            left_out: list[str] | None = None, only: tuple[int, frozenset[str]] | None = None,
-            ) -> list[FloatArray]:
+            left_out: list[str] | None = None) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
-    # only: a column, and its words that mark rows with numbers; text in other rows becomes NaN,
-    # and the next column is not read for units.
     # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
     parts: list[list[FloatArray]] = [[] for _ in places]
-    with_unit = [place for place in places if not only and has_unit_beside(form.names, place)]
+    with_unit = [place for place in places if has_unit_beside(form.names, place)]
     last = max([*places, *(texts or {}), *(place + 1 for place in with_unit)])
     width = len(form.names)
     try:
@@ -576,9 +573,6 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                 good = np.ones(len(rows), dtype=bool)
                 for place, part in zip(places, parts):
                     cells = columns[place]
-                    if only:
-                        cells = tuple(cell if name in only[1] or is_number(cell) else 'nan'
-                                      for cell, name in zip(cells, columns[only[0]]))
                     if place in with_unit:
                         cells = _with_units(cells, columns[place + 1], form.units[place])
                     part.append(_floats(path, lines, cells, form, place,

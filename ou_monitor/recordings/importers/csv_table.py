@@ -1,11 +1,11 @@
 """
 Read a table of text, such as a CSV: time, voltage and, where present, throttle and current.
 
-Limits: a file is one flight; all rows have the same number of cells. If rows hold a value and the
-name of its series, each series is read as a column of that name. Columns and units are found by
-names and by the sizes of values, and reported in one note; fields of `CsvColumns` override them. A
-unit in a name or in a line of units is taken as stated; an unstated unit is guessed from the
-values. `time_s`, `voltage_v`, `throttle` and `current_a` are taken first and need no note.
+Limits: a file is one flight; all rows have the same number of cells; a column holds one series.
+Columns and units are found by names and by the sizes of values, and reported in one note; fields
+of `CsvColumns` override them. A unit in a name or in a line of units is taken as stated; an
+unstated unit is guessed from the values. `time_s`, `voltage_v`, `throttle` and `current_a` are
+taken first and need no note.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
     AMPERE_WORDS, CHANNEL, clock_times, factor_of, FileColumn, has_day, in_si, is_clock,
     is_missing, is_number, is_value, lower_rows, MOST_VOLTS, number_of, OTHER_WORDS, PULSE_WORDS,
-    SCALES, SHARE_WORDS, shown, stamps_of, TIME_WORDS, unit_of, unit_word, unwrapped, VOLT_WORDS,
-    WORDS)
+    SCALES, SHARE_WORDS, shown, stamps_of, TIME_WORDS, unit_of, unwrapped, VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
     Form, form_of, has_unit_beside, holds_clocks, holds_numbers, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
@@ -230,8 +229,7 @@ def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
         with suppress(InputError):
             form = form_of(path, wanted, header=header)
             time = _time_of(path, form, wanted)
-            if not _series_of(path, form, wanted, time):
-                _supply_of(path, form, wanted, time, ' (--voltage-column)')
+            _supply_of(path, form, wanted, time, ' (--voltage-column)')
             return True
     return False
 
@@ -239,12 +237,8 @@ def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
 def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
            needed: str = ' (--voltage-column)', left_out: list[str] | None = None) -> _Table:
     """Read time, supply and named columns (needed: hint if no voltage is found; '': optional)."""
-    raw = form = form_of(path, wanted)
-    time = clock = _time_of(path, form, wanted)
-    if series := _series_of(path, form, wanted, time):
-        form, label, value = series
-        asked = {*more}
-        more, time = form.names, time._replace(place=())
+    form = form_of(path, wanted)
+    time = _time_of(path, form, wanted)
     found = _supply_of(path, form, wanted, time, needed)
     if wanted.decimal is None and _has_thousands(form, time, found):
         return _table(path, replace(wanted, decimal=','), more=more, needed=needed,
@@ -263,22 +257,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
                 form.cells(k) == form.cells(place) for k in same)):
             raise InputError(f"{path}:{form.line}: column '{form.names[place]}' occurs twice" + (
                 ', with other times: give --sample-interval' * (place in time.place)))
-    if series:
-        labels: list[str] = []
-        t, (mixed,) = _read(path, raw, clock, [value], left_out, {label: labels}, (
-            label, frozenset(asked.union(column.name for column in found.values()))))
-        mine, *others_of = (np.array(labels) == form.names[place] for place in places)
-        _check_one_series(path, raw, t, raw.names[value], np.where(mine, mixed, np.nan),
-                          (*clock.place, value))
-        values, stamps, t = [mixed[mine]], t, t[mine]
-        for rows in others_of:
-            # Hold the last value of each other series at the stamps of the voltage.
-            part = np.flatnonzero(rows)
-            part = part[np.argsort(stamps[part], kind='stable')]
-            values.append(np.append(mixed[part], np.nan)[
-                np.searchsorted(stamps[part], t, side='right') - 1])
-    else:
-        t, values = _read(path, form, time, places, left_out)
+    t, values = _read(path, form, time, places, left_out)
     volts = next(zip(found, values), (None, t))[1] if logs.VOLTAGE in found else t
     if time.place and (np.diff(t) < 0.0).sum() > _BACK * t.size and (np.diff(volts) > 0.0).all():
         raise InputError(f"{path}: '{time.name}' runs backwards, and '{found[logs.VOLTAGE].name}' "
@@ -287,10 +266,10 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
             volts).any() and len(form.names) > 2:
         raise InputError(f"{path}: '{found[logs.VOLTAGE].name}' is 0 or blank in every row, as if "
                          'it had no sensor: name another column by --voltage-column')
-    if logs.VOLTAGE in found and not series:
+    if logs.VOLTAGE in found:
         _check_one_series(path, form, t, found[logs.VOLTAGE].name, volts, (*time.place, *places))
-    t, words = stamps_of(path, t, clock, wanted.time_unit is not None,
-                         bool(clock.place) and holds_clocks(raw, clock.place[0]))
+    t, words = stamps_of(path, t, time, wanted.time_unit is not None,
+                         bool(time.place) and holds_clocks(form, time.place[0]))
     even = spread(t, volts)
     if not np.array_equal(even, t, equal_nan=True):
         words += ', equal stamps spread evenly, a guess: --sample-interval'
@@ -615,36 +594,9 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
     return found
 
 
-def _series_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn,
-               ) -> tuple[Form, int, int] | None:
-    """Return a form with a column per series that rows name, and where names and values are."""
-    named = _choose(form, logs.VOLTAGE, time.place)
-    if not form.line or not time.place or (
-            named if wanted.voltage is None else _place_of(form, wanted.voltage) is not None):
-        return None
-    places = [k for k in range(min(form.width, len(form.names))) if k not in time.place]
-    value = [k for k in places if holds_numbers(form, k, False) and re.fullmatch(
-        rf'(?=.)(?:{_VALUE_NAME}|state)', form.names[k].lower())] or named
-    for place in (k for k in places if value and not holds_numbers(form, k, True)):
-        labels: list[str] = []
-        stated: list[str] = []
-        beside = has_unit_beside(form.names, value[0]) and value[0] + 1 != place
-        numbers(path, form, [], {place: labels} | ({value[0] + 1: stated} if beside else {}), [])
-        names = tuple(sorted({*labels} - {''}))
-        own = {name: unit_word(unit) for name, unit in zip(labels, stated)}
-        series = form._replace(names=names, width=len(names), rows=(), units=tuple(
-            unit_of(name)[1] or (word if (word := own.get(name, '')) in WORDS else '')
-            or unit_of(form.names[value[0]])[1] for name in names))
-        if wanted.voltage in names or len(names) <= MOST_COLUMNS and _choose(
-                series, logs.VOLTAGE):
-            return series, place, value[0]
-    return None
-
-
 def _read(path: Path, form: Form, time: FileColumn, places: list[int],
-          left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
-          only: tuple[int, frozenset[str]] | None = None) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the time as written (dates and clocks in s), and columns; texts as in `numbers`."""
+          left_out: list[str] | None = None) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the time as written (dates and clocks in s), and columns."""
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
             raise InputError(f"{path}: by '{time.name}' the rows are {time.scale:g} s apart, not "
@@ -653,14 +605,13 @@ def _read(path: Path, form: Form, time: FileColumn, places: list[int],
         return time.scale * np.arange(float(values[0].size)), values
     if holds_clocks(form, time.place[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
-        values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
-                         left_out, only)
+        values = numbers(path, form, places, dict(zip(time.place, clocks)), left_out)
         cells = list(map(' '.join, zip(*clocks)))
         if len(clocks) > 1 and all(re.fullmatch(r'[\d.]+', part) for part in clocks[1]):
             cells = [f"{clock}.{part.split('.')[-1] if '.' in part else f'{part:0>3}'}"
                      for clock, part in zip(*clocks)]
         return clock_times(path, cells, time.name, left_out), values
-    t, *values = numbers(path, form, [*time.place, *places], texts, left_out, only)
+    t, *values = numbers(path, form, [*time.place, *places], left_out=left_out)
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
@@ -699,8 +650,8 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
             raise InputError(
                 f"{path}: '{column}' holds several series, named in '{label}': "
                 f'{shown(some(map(printable, names), 3))}; ' + (
-                    'name one with --voltage-column, or ' * bool(form.line) if words else
-                    'if these are a load, give --throttle-column; else ') + 'keep the rows of one')
+                    '' if words else 'if these are a load, give --throttle-column; else ')
+                + 'keep the rows of one')
 
 
 def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
