@@ -106,7 +106,6 @@ class Form(NamedTuple):
     names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
     units: tuple[str, ...]  # As stated, '' if not stated
     width: int  # Cells of a row
-    indent: int  # Blank cells before each row, if rows of outer tables lie between them
     rows: tuple[tuple[str, ...], ...]  # The first rows
     step: float  # From row to row, s; NaN: not stated
     stated: str  # Words that state the step
@@ -141,8 +140,7 @@ def form_of(path: Path, wanted: CsvColumns, *, header: bool = False) -> Form:
         if not known and delimiter == ',':
             known = next((mark for mark, both in _BOTH_MARKS.items() if re.search(
                 f'"[-+]?{both}[^",]*"', text)), '') or '.' * bool(
-                    _OF_QUOTED.search(text) and _OF_PLAIN.search(text)) or ',' * bool(
-                        _names_half(_split(lines, ',', False, '')))
+                    _OF_QUOTED.search(text) and _OF_PLAIN.search(text))
         # Where commas do not separate cells, the other mark may separate thousands.
         for mark, known in [(mark, known) for mark in known or '.,'] + [
                 (mark, mark) for mark in ',.' if not known and delimiter != ',']:
@@ -219,12 +217,6 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
         # The names do not fit the columns: rows have lost or gained cells.
         return None
     first += _numbering(rows[first:]) if at else 0
-    # Battery testers indent the names and rows of an inner table by blank cells.
-    indent = next((k for k, name in enumerate(rows[at - 1]) if name), 0) if (
-        0 < at <= first) else 0
-    inner = [_of_table(row, indent) for row in rows[first:]]
-    indent *= any(map(any, inner))
-    rows[first:] = inner if indent else rows[first:]
     cells = [cell for row in rows[first:] for cell in row if cell]
     fit = sum(map(is_value, cells)) / max(len(cells), 1)
     above = lines[:max(first, 20)]
@@ -232,8 +224,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
         encoding, delimiter, comma, mark, first, at, labels, ''.join(lines[:first]),
-        tuple(names), _units_of(names, words, rows, first, at), width, indent, first_rows, step,
-        stated)
+        tuple(names), _units_of(names, words, rows, first, at), width, first_rows, step, stated)
 
 
 def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
@@ -241,34 +232,11 @@ def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[lis
     rows = [[cell.strip() for cell in next(csv.reader(
         _prepared([line], delimiter, comma, mark), delimiter=delimiter, skipinitialspace=True),
         [])] for line in lines]
-    if comma and delimiter == ',':
-        half = _names_half(rows)
-        return [_joined(row, half) or list(map(_with_point, row)) for row in rows]
-    return rows
-
-
-def _names_half(rows: list[list[str]]) -> int:
-    """Return the number of names if the rows below hold two whole numbers for each, else 0."""
-    # Unquoted decimal commas between commas split each number in two.
-    filled = [row for row in rows if any(row)]
-    first = next((k for k, row in enumerate(filled) if _joined(row, len(row) // 2)), 0)
-    size, below = len(filled[first - 1]) if first else 0, filled[first:]
-    return size if sum(bool(_joined(row, size)) for row in below) > max(1, len(below) // 2) else 0
-
-
-def _joined(row: list[str], names: int) -> list[str]:
-    """Join whole numbers in pairs if a row has two for each name; else return no cells."""
-    split = len(row) == 2 * names and all(map(re.compile(r'[-+]?\d+').fullmatch, row))
-    return [f'{whole}.{part}' for whole, part in zip(row[::2], row[1::2])] if split else []
+    return [list(map(_with_point, row)) for row in rows] if comma and delimiter == ',' else rows
 
 
 def _trimmed(row: list[str]) -> list[str]:
     return row[:max((k + 1 for k, cell in enumerate(row) if cell), default=0)]
-
-
-def _of_table(row: list[str], indent: int) -> list[str]:
-    """Return a row, but no cells if it belongs to an outer table of a battery tester."""
-    return [] if any(cell.strip() for cell in row[:indent]) else row
 
 
 def _labels_of(rows: list[list[str]]) -> tuple[str, ...]:
@@ -636,9 +604,7 @@ def _blocks(path: Path, file: TextIO, form: Form, width: int,
                     raise InputError(f'{path}:{line + 1 - _lines_of(row)}: whole lines after this '
                                      'one are within a quote: close each quote in its line')
         if form.comma and form.delimiter == ',':
-            rows = [_joined(row, width) or list(map(_with_point, row)) for row in rows]
-        if form.indent:
-            rows = [_of_table(row, form.indent) for row in rows]
+            rows = [list(map(_with_point, row)) for row in rows]
         yield lines, rows
 
 

@@ -702,4 +702,4 @@ def _read_note(form: Form, time: FileColumn, found: dict[str, FileColumn], units
         also += f'; not read: {some(rest, 3)} ({options})' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
             f"{'comma' if form.comma else 'point'}{thousands}{encoding}, numbers from line "
-            f'{form.skip + 1} on{", without rows of outer tables" * (form.indent > 0)}.')
+            f'{form.skip + 1} on.')

@@ -431,17 +431,9 @@ FORMS = {
     # The lowest and the highest of each interval.
     'rohde_pairs': (table(['in s,C1 in V'], lambda k: (
         f'{0.1 * k:.6E},{V[k] + 0.1:.4E}\n{0.1 * k:.6E},{V[k]:.4E}')), 0.1, False, False),
-    # A battery tester: a line for each cycle and step above its indented records.
-    'outer_tables': (table(
-        ['Cycle,Cap(Ah),Time', ',Step,Name,End(V),Time', ',,Record,Total Time,Voltage(V),Date'],
-        lambda k: f'{k // 30},0.02,0.33\n,{k // 10},Rest,{V[k]},0:01:00\n' * (k % 10 == 0) + (
-            f',,{k},0:00:{k:02},{V[k]},02/21/2020 10:32:{k:02}')), 1.0, False, False),
     # A voltage with a current of its name is preferred.
     'two_packs': (table(['t,12V battery voltage,HV battery voltage,HV battery current'],
                         lambda k: f'{k},{5 + k % 2},{V[k]},{AMPS[k]}'), 1.0, False, True),
-    # Decimal commas between commas: each number takes two cells.
-    'split_numbers': (table(['Time (ms),Voltage (V),Current (A)'], lambda k: german(
-        f'{20.0 * k:.3f};{V[k]:.3f};{AMPS[k]:+.3f}').replace(';', ',')), 0.02, False, True),
 }
 
 
@@ -470,7 +462,6 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     assert len({*found.source} - {'time_unit'}) == 3 + throttle + current
     said = [note for note in found.notes if note.startswith('Read time from')]
     assert len(said) == (form != 'plain')
-    assert form != 'outer_tables' or 'without rows of outer tables' in said[0]
     # Dates are not taken for a time in ms.
     assert not any('apart' in note for note in found.notes)
     # The bag that `convert` writes holds the same samples.
@@ -1033,7 +1024,12 @@ def test_a_file_of_another_kind_is_named(content, words, tmp_path):
     ('time,U\n10:00:00,12\n10:00:99,12\n', "'10:00:99'"),
     ('time,U\n10:00:00,12\n10:99:00,12\n', "'10:99:00'"),
     ('time,U\n10:00:00,12\n10:00:01+99:99,12\n', r"'10:00:01\+99:99'"),
-    (FORMS['split_numbers'][0] + '1200,000,15,300,2\n', ':62: 5 cells')])
+    # Decimal commas between commas; rows of an outer table, as battery testers write them.
+    ('t,U\n0,000,12,500\n20,000,12,525\n', ':2: 4 cells, and the header names 2'),
+    (table(['Cycle,Cap(Ah),Time', ',Step,Name,End(V),Time', ',,Record,Total Time,Voltage(V),Date'],
+           lambda k: f'{k // 30},0.02,0.33\n,{k // 10},Rest,{V[k]},0:01:00\n' * (k % 10 == 0) + (
+               f',,{k},0:00:{k:02},{V[k]},02/21/2020 10:32:{k:02}')),
+     "4: the line ends before column 'Voltage")])
 def test_cells_that_are_no_time_or_number_are_refused(content, words, tmp_path):
     with pytest.raises(InputError, match=words):
         read_recording(written(tmp_path, content))
