@@ -211,7 +211,7 @@ def test_the_mixture_of_jumps_is_that_of_the_largest_likelihood():
     # sqrt(800), widened by the noise in each (a third of the spread), the scale of the rest to 1 /
     # sqrt(2 n).
     z, var = jumping(1)
-    share, mean, spread, unit = _mixture(z, var)
+    share, mean, spread, unit = _mixture(z, var, centred=False)
 
     def loss(x):
         size, scale = np.exp(x[2]), np.exp(x[3])
@@ -255,7 +255,7 @@ def test_scores_and_densities_are_those_of_the_mixture():
     """Normal scores of its distribution function, and its density over that of N(0, 1)."""
     z, var = jumping(3, share=0.03, n=4000)
     fit = Jumps.fit_law(view_of_jumps(z, var))
-    share, mean, spread, unit = _mixture(z, var)
+    share, mean, spread, unit = _mixture(z, var, centred=False)
     middle, wide = mean / np.sqrt(var), np.sqrt(unit**2 + spread**2 / var)
     below = (1.0 - share) * norm.cdf(z, 0.0, unit) + share * norm.cdf(z, middle, wide)
     density = (1.0 - share) * norm.pdf(z, 0.0, unit) + share * norm.pdf(z, middle, wide)

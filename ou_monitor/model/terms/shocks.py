@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
@@ -80,7 +81,7 @@ class Jumps(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a mixture to the scores: most are normal, and some contain a jump."""
-        return cls._best_fit(view, _OFTEN)
+        return _if_worth(cls._best_fit(view, _OFTEN), view)
 
     def refit_law(self, view: View) -> LawFit | None:
         return self._best_fit(view, 1.0)
@@ -88,7 +89,14 @@ class Jumps(Term):
     @classmethod
     def _best_fit(cls, view: View, most: float) -> LawFit | None:
         """Return the fit; None if the share of samples with a jump is above `most`."""
-        found = _rare_events(view)
+        # A free mean size must earn its price: of one or two jumps it would explain the size.
+        found = [fit for fit in (cls._fit(view, most, True), cls._fit(view, most, False))
+                 if fit is not None]
+        return max(found, default=None, key=lambda fit: _worth(fit, view))
+
+    @classmethod
+    def _fit(cls, view: View, most: float, centred: bool) -> LawFit | None:
+        found = _rare_events(view, centred)
         if found is None or found[0] > most:
             return None
         share, mean, spread, jumped, scores, gain = found
@@ -98,10 +106,19 @@ class Jumps(Term):
         term = cls(share / step, mean, spread)
         se = {'rate': term.rate / math.sqrt(max(n, 1.0)), 'mean': spread / math.sqrt(max(n, 1.0)),
               'std': spread / math.sqrt(2.0 * max(n, 1.0))}
-        return LawFit(term, se, scores, gain, 4, push=push)
+        return LawFit(term, se, scores, gain, 3 if centred else 4, push=push)
 
 
-def _rare_events(view: View, centred: bool = False
+def _worth(fit: LawFit, view: View) -> float:
+    """Return the gain of a law less the penalty of its parameters, nats."""
+    return float(fit.gain.sum()) - 0.5 * fit.free * math.log(view.train.stop)
+
+
+def _if_worth(fit: LawFit | None, view: View) -> LawFit | None:
+    return fit if fit is not None and _worth(fit, view) > 0.0 else None
+
+
+def _rare_events(view: View, centred: bool
                  ) -> tuple[float, float, float, FloatArray, FloatArray, FloatArray] | None:
     """Return share, mean and std (V) of events, their probabilities, scores and gains."""
     z, var = view.z, view.variance
@@ -126,22 +143,22 @@ def _parts(z: FloatArray, var: FloatArray, share: float, mean: float, spread: fl
     return calm, jump
 
 
-def _mixture(z: FloatArray, var: FloatArray, centred: bool = False
+def _mixture(z: FloatArray, var: FloatArray, centred: bool
              ) -> tuple[float, float, float, float] | None:
     """Return share, mean and std (V) of the events, and the scale of the noise, by EM."""
     # centred: the mean is 0.
     s = np.sqrt(var)
-    big = np.abs(z) > 4.0
-    if big.sum() < 3:
-        return None
-    share = float(big.mean())
+    # Start from the largest scores.
+    count = max(int((np.abs(z) > 4.0).sum()), 3)
+    big = np.argsort(np.abs(z))[-count:]
+    share = count / z.size
     mean = 0.0 if centred else float((z * s)[big].mean())
     spread, unit = float((z * s)[big].std() + s.mean()), 1.0
     for _ in range(60):
         calm, jump = _parts(z, var, share, mean, spread, unit)
         weight = np.exp(jump - np.logaddexp(calm, jump))
         total = float(weight.sum())
-        if total < 2.0:
+        if total < 1.0:
             return None
         before = share
         share = min(total / z.size, 0.5)
@@ -195,34 +212,12 @@ class Glitches(Term):
         return self.probability <= 2.0 * _OFTEN
 
     @classmethod
+    def variants(cls) -> Sequence[type[Term]]:
+        return (SmallGlitches,)
+
+    @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Return the better fit: clear runs of bad samples, or a mixture for small errors."""
-        return cls._best_fit(view, _OFTEN)
-
-    def refit_law(self, view: View) -> LawFit | None:
-        return self._best_fit(view, 1.0)
-
-    @classmethod
-    def _best_fit(cls, view: View, most: float) -> LawFit | None:
-        """Return the better fit; a mixture only if the share of errors is at most `most`."""
-        found = [fit for fit in (cls.fit_runs(view), cls._fit_mixture(view, most))
-                 if fit is not None]
-        return max(found, default=None, key=lambda fit: float(
-            fit.gain[view.train].sum()) - 0.5 * fit.free * math.log(view.train.stop))
-
-    @classmethod
-    def _fit_mixture(cls, view: View, most: float) -> LawFit | None:
-        """Fit a mixture to the scores: most are normal, and some contain an error."""
-        found = _rare_events(view, centred=True)
-        if found is None or found[0] > most:
-            return None
-        share, _, spread, bad, scores, gain = found
-        count = max(share * view.train.stop, 1.0)
-        se = {'probability': share / math.sqrt(count), 'std': spread / math.sqrt(2.0 * count)}
-        # With this variance, the next fit has the mean of the gains with and without an error.
-        part = bad * spread * spread / (view.variance + spread * spread)
-        return LawFit(cls(share, spread), se, scores, gain, 3,
-                      error=view.variance * part / (1.0 - part))
+        return cls.fit_runs(view)
 
     @classmethod
     def fit_runs(cls, view: View) -> LawFit | None:
@@ -256,6 +251,36 @@ class Glitches(Term):
         # With this variance of the error, the next fit ignores the bad samples.
         return LawFit(term, se, scores, gain, free,
                       error=np.where(bad, spread * spread, 0.0))
+
+
+class SmallGlitches(Glitches):
+    """The same errors, found by the distribution of all scores, not one by one."""
+
+    @classmethod
+    def variants(cls) -> Sequence[type[Term]]:
+        return ()
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit a mixture to the scores: most are normal, and some contain an error."""
+        return _if_worth(cls._best_fit(view, _OFTEN), view)
+
+    def refit_law(self, view: View) -> LawFit | None:
+        return self._best_fit(view, 1.0)
+
+    @classmethod
+    def _best_fit(cls, view: View, most: float) -> LawFit | None:
+        """Return the fit; None if the share of samples with an error is above `most`."""
+        found = _rare_events(view, centred=True)
+        if found is None or found[0] > most:
+            return None
+        share, _, spread, bad, scores, gain = found
+        count = max(share * view.train.stop, 1.0)
+        se = {'probability': share / math.sqrt(count), 'std': spread / math.sqrt(2.0 * count)}
+        # With this variance, the next fit has the mean of the gains with and without an error.
+        part = bad * spread * spread / (view.variance + spread * spread)
+        return LawFit(cls(share, spread), se, scores, gain, 3,
+                      error=view.variance * part / (1.0 - part))
 
 
 def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
