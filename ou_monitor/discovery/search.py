@@ -39,9 +39,8 @@ Progress = Callable[[float], None]
 # Terms by which noise or alpha depends on throttle.  Their effects on one-step errors are similar,
 # so one may be exchanged for another.
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
-# Intensity over throttle: a second of these terms may only correct the form of the first.
-_CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
-           LoadDependentNoise.NAME: LoadDependentSigma.NAME}
+# Intensity over throttle: a further term of it may only correct the form of one of these.
+_CURVES = LoadDependentSigma.NAME, LoadDependentNoise.NAME
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
 # If the best fit of a round takes less time than this, s, the response to load is chosen anew.
@@ -165,7 +164,8 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
             fitter.samples.throttle is not None, first)
         trials += [trial for trial in fitter.trials(
             search.composite, kinds, lambda model: criticise(fitter.samples, model, bank))
-                   if trial.evidence > _needed(fitter, search.composite, trial.name)]
+                   if trial.evidence > _needed(
+                       fitter, search.composite, trial.composite.last(trial.kind))]
         steady = [trial for trial in trials if decision.is_shared([
             float(part.sum()) for part in np.array_split(
                 trial.composite.density - search.composite.density, BLOCKS)], Z95)]
@@ -177,10 +177,11 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
         catalogue()[trial.name].MEASURED and trial.evidence > trials[0].evidence - decision.TIE))
 
 
-def _needed(fitter: Fitter, model: Composite, name: str, least: float = decision.ACCEPT) -> float:
+def _needed(fitter: Fitter, model: Composite, term: Term, least: float = decision.ACCEPT) -> float:
     """Return the minimum evidence for adding a cause to a model, nats."""
-    other = _CURVES.get(name, '')
-    if not model.has(other):
+    other = next((name for name in _CURVES if name != term.NAME and model.has(name)), '')
+    if not other or not (term.NAME in _CURVES or (
+            isinstance(term, LoadDependentAlpha) and term.sigma_slope)):
         return least
     less = _without(fitter, model, other)
     worth = fitter.evidence(model) - (0.0 if less is None else fitter.evidence(less))
@@ -217,7 +218,7 @@ def _make_best_move(fitter: Fitter, search: Search) -> bool:
         less = _without(fitter, search.composite, name)
         if less is None:
             continue
-        needed = _needed(fitter, less, name, decision.TIE)
+        needed = _needed(fitter, less, search.composite.last(catalogue()[name]), decision.TIE)
         if value - fitter.evidence(less) < needed + _ROUGH:
             less = _refit(fitter, less)
         if fitter.holds(less):

@@ -8,7 +8,7 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import fit_gaussian
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import LoadDependentAlpha, LoadSag
 from ou_monitor.model.terms.ou import NonlinearRestoring, OU
 from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise
 from ou_monitor.model.terms.regime_switching import SwitchingLevels
@@ -70,6 +70,42 @@ def test_errors_of_readings_hardly_larger_than_the_noise_are_named():
              for seed in range(4)]
     assert sum('glitches' in one for one in named) >= 3
     assert not any('volatility' in one for one in named)
+
+
+def test_few_jumps_are_named_as_jumps():
+    """Fourteen in all, most of them later than the part to which the search fits."""
+    # One jump of some one-step deviations in the fitted part gives share and size; the others
+    # are scored with these.  A single one cannot show a mean size.
+    rng = np.random.default_rng(6)
+    n, phi = 4800, 0.77
+    named = []
+    for _ in range(6):
+        push = rng.standard_normal(n)
+        early, late = rng.integers(100, int(0.6 * n), 1), rng.integers(int(0.6 * n), n, 13)
+        push[early] = 8.0 * rng.choice([-1.0, 1.0])
+        push[late] += 12.0 * rng.standard_normal(late.size)
+        v = 23.0 + 0.014 * lfilter([1.0], [1.0, -phi], push)
+        named.append({cause.name for cause in discover(
+            Recording(np.arange(n) / 62.5, v, None)).causes})
+    assert sum('jumps' in one for one in named) >= 5
+    assert not any('heavy_tails' in one for one in named)
+
+
+@pytest.mark.parametrize('slope', [-2.0, 2.0])
+def test_a_relaxation_that_changes_under_load_has_one_name_if_var_inf_stays(slope):
+    """Sigma follows alpha then, which is one cause, not noise that follows throttle as well."""
+    t = np.arange(8000) / 100.0
+    u = 0.5 + 0.4 * np.sign(np.sin(2.0 * np.pi * t / 8.0))
+    model = SupplyModel((OU(12.0, 0.1, 11.0), LoadDependentAlpha(slope, 0.5 * slope),
+                         MeasurementNoise(0.008)))
+    found = [discover(Recording(t, model.simulate(t, np.random.default_rng(seed), u), u))
+             for seed in range(4)]
+    named = [{cause.name for cause in one.causes} for one in found]
+    # Law and white noise gain 450 to 700 nats.
+    assert sum(one == {'load_dependent_alpha', 'measurement_noise'} for one in named) >= 3
+    law = next(cause.term for cause in found[0].causes if cause.name == 'load_dependent_alpha')
+    assert law.slope == pytest.approx(slope, abs=0.7)
+    assert law.sigma_slope == pytest.approx(0.5 * slope, abs=0.3)
 
 
 def test_a_lagged_sag_under_jittering_throttle_is_found():

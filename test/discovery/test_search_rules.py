@@ -21,6 +21,7 @@ import pytest
 BASE = OU(50.0, 0.5, 5.0)
 NOISE, SLOW = MeasurementNoise(0.01), SecondRelaxation(3.0, 0.1)
 SIGMA = LoadDependentSigma((0.0, 1.0), (0.0, 0.5))
+LAW = LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5))
 
 
 class Model:
@@ -32,6 +33,9 @@ class Model:
 
     def has(self, name):
         return any(term.NAME == name for term in self.terms)
+
+    def last(self, kind):
+        return [term for term in self.terms if term.NAME == kind.NAME][-1]
 
 
 class Table(Fitter):
@@ -91,21 +95,21 @@ def test_the_move_that_pays_most_comes_first():
 
 def test_a_term_that_modifies_a_removed_one_is_removed_too():
     """Noise that follows throttle is nothing without white noise."""
-    law = LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5))
-    search = Search(Model([BASE, NOISE, law], 20.0), [NOISE.NAME, law.NAME])
+    search = Search(Model([BASE, NOISE, LAW], 20.0), [NOISE.NAME, LAW.NAME])
     fitter = Table({(): 19.0, ('measurement_noise',): 0.0})
     fitter.best_start = lambda composite, kind, view: None
     rules.backward(fitter, search)
     assert search.accepted == [] and search.composite.terms == (BASE,)
 
 
-@pytest.mark.parametrize('name, price', [
-    ('load_dependent_noise', 10.0), ('drift', 4.0), ('load_dependent_sigma', 4.0)])
-def test_a_second_curve_must_add_a_tenth_of_the_first(name, price):
+@pytest.mark.parametrize('term, price', [
+    (LAW, 10.0), (Drift(0.1, 0.0), 4.0), (SIGMA, 4.0), (LoadDependentAlpha(0.5), 4.0),
+    (LoadDependentAlpha(0.5, 0.2), 10.0)])
+def test_a_second_curve_must_add_a_tenth_of_the_first(term, price):
     # A rough fit of the table is a nat worse.
     fitter = Table({('measurement_noise',): 401.0})
-    assert rules._needed(fitter, Model([BASE, NOISE, SIGMA], 500.0), name) == pytest.approx(price)
-    assert rules._needed(fitter, Model([BASE], 0.0), 'load_dependent_noise') == decision.ACCEPT
+    assert rules._needed(fitter, Model([BASE, NOISE, SIGMA], 500.0), term) == pytest.approx(price)
+    assert rules._needed(fitter, Model([BASE], 0.0), LAW) == decision.ACCEPT
 
 
 def test_a_cause_that_was_removed_again_is_not_accepted_twice(monkeypatch):
@@ -164,8 +168,7 @@ def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
     assert found.found.search.accepted == named and [*found.dropped] == [NOISE.NAME]
 
 
-LAWS = {'s': SIGMA, 'n': LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5)),
-        'a': LoadDependentAlpha(0.5)}
+LAWS = {'s': SIGMA, 'n': LAW, 'a': LoadDependentAlpha(0.5)}
 
 
 def compared(worth, letters):

@@ -16,7 +16,7 @@ EXAMPLES = {
     'load_transient': {'gain': -0.2, 'tau': 0.03, 'delay': 0.0125, 'rise': 0.1,
                        'square': -0.3, 'lagged': 0.2},
     'load_dependent_sigma': {'throttle': [0.0, 0.4, 1.0], 'log_factor': [0.0, 0.7, 0.4]},
-    'load_dependent_alpha': {'slope': 0.8},
+    'load_dependent_alpha': {'slope': 0.8, 'sigma_slope': 0.4},
     'load_dependent_noise': {
         'number': [0, 0, 0, *np.repeat(np.arange(1, 11), 2).tolist()],
         'at': [0.0, 0.5, 1.0, *[0.0, 0.2] * 9, -0.6, 1.5],

@@ -405,14 +405,19 @@ def _greedy(bins: Bins, knots: FloatArray, penalty: float, apart: float
 
 @dataclass(frozen=True)
 class LoadDependentAlpha(Term):
-    """Multiply alpha by exp(slope * throttle)."""
+    """
+    Multiply alpha by exp(slope * throttle), and sigma by exp(sigma_slope * throttle).
+
+    A sigma_slope of exactly 0 is not fitted; with half of the slope, Var_inf does not change.
+    """
 
     NAME = 'load_dependent_alpha'
     FAMILY = 'restoring'
     STAGE = Stage.DRIVE
     NEEDS_THROTTLE = True
     ROLE = Role.DRIVE
-    FREE = ('slope',)
+    FREE = by_parameters(('slope', 'sigma_slope'), lambda term: (
+        ('slope', 'sigma_slope') if term.sigma_slope else ('slope',)))
     SIGNS = ('state throttle',)
     MEASURED = True
     LIVE = True
@@ -421,21 +426,23 @@ class LoadDependentAlpha(Term):
         'Fit each throttle level separately (analyze): a single alpha is right at one level only.')
     SEPARATED_BY = 'throttle held for 50 relaxation times at each of several levels'
 
-    slope: float = parameter('', 'ln of the factor at full throttle')
+    slope: float = parameter('', 'ln of the factor of alpha at full throttle')
+    sigma_slope: float = parameter('', 'ln of the factor of sigma at full throttle', default=0.0)
 
     def change(self, s: Segment) -> None:
         s.alpha *= np.exp(self.slope * s.throttle)
+        s.sigma *= np.exp(self.sigma_slope * s.throttle)
 
     def moved(self, name: str, by: float) -> LoadDependentAlpha:
-        return replace(self, slope=self.slope + by)
+        return replace(self, **{name: getattr(self, name) + by})
 
     def per_coordinate(self, name: str) -> float:
         return 1.0
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a slope of 0 as the start."""
-        return () if view.throttle is None else (cls(0.0),)
+        """Return a slope of alpha alone, and one of both, each from 0."""
+        return () if view.throttle is None else (cls(0.0), cls(0.0, NEXT_TO_ZERO))
 
 
 # Time constants of the moving means of throttle from which changes are measured, s.
