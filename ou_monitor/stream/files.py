@@ -26,10 +26,9 @@ _MOST_OF_PATH = 150
 
 # Maximum size of a YAML file: a model file has some kB.  PyYAML takes 2 to 5 s for 1 MB.
 MOST_BYTES = 1_000_000
-# Maximum number of values with aliases expanded, against "billion laughs" files; depth; aliases.
+# Maximum number of values, and depth.
 MOST_NODES = 20_000
 MOST_DEPTH = 64
-MOST_ALIASES = 100
 # Maximum digits of a number: the largest float64 has 309, and conversion takes quadratic time.
 MOST_DIGITS = 400
 
@@ -132,35 +131,26 @@ def _without_content(error: yaml.MarkedYAMLError) -> str:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader: each key once, with limits on depth, aliases, nodes and digits."""
+    """PyYAML's safe loader: each key once, no aliases, limits on depth, nodes and digits."""
 
     def __init__(self, text: str, most_nodes: int) -> None:
         super().__init__(text)
         self._most_nodes = most_nodes
-        self._nodes = self._depth = self._aliases = 0
-        # Anchor -> number of nodes it expands to; it is entered once its node is complete.
-        self._sizes: dict[str, int] = {}
+        self._nodes = self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose a node and count it, with aliases expanded."""
+        """Compose a node and count it; refuse an alias, of which a few stand for 10^12 values."""
         event = self.peek_event()
         if isinstance(event, yaml.AliasEvent):
-            self._aliases += 1
-            if self._aliases > MOST_ALIASES:
-                self._refuse(f'it has more than {MOST_ALIASES} aliases', event)
-            if event.anchor in self.anchors and event.anchor not in self._sizes:
-                self._refuse('an alias contains itself', event)
-            self._count(self._sizes.get(event.anchor, 0), event)
-            return super().compose_node(parent, index)
-        before = self._nodes
-        self._count(1, event)
+            self._refuse('it has an alias: write the value in its place', event)
+        self._nodes += 1
+        if self._nodes > self._most_nodes:
+            self._refuse(f'it holds more than {self._most_nodes} values', event)
         self._depth += 1
         if self._depth > MOST_DEPTH:
             self._refuse(f'it is nested more than {MOST_DEPTH} deep', event)
         node = super().compose_node(parent, index)
         self._depth -= 1
-        if event.anchor is not None:
-            self._sizes[event.anchor] = self._nodes - before
         return node
 
     def compose_mapping_node(self, anchor: Any) -> Any:
@@ -184,11 +174,6 @@ class _BoundedLoader(yaml.SafeLoader):
         except (ValueError, OverflowError, TypeError, LookupError, AttributeError):
             # PyYAML passes on Python's errors for a value that does not fit its tag.
             self._refuse('a value is impossible or does not fit its tag', node)
-
-    def _count(self, nodes: int, at: Any) -> None:
-        self._nodes += nodes
-        if self._nodes > self._most_nodes:
-            self._refuse(f'it holds more than {self._most_nodes} values', at)
 
     def _refuse(self, why: str, at: Any) -> None:
         raise yaml.composer.ComposerError(None, None, why, at.start_mark)
