@@ -15,9 +15,7 @@ wstring is refused.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-import mmap
 import struct
 from typing import Any, NamedTuple
 
@@ -349,53 +347,29 @@ _NO_MESSAGE = FieldColumn(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bo
                           np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 
-# Bytes from which a column takes large pages, and their size: it takes longer to map 4 kB than to
-# fill them.
-_LARGE, _PAGE = 1 << 22, 1 << 21
-
-
 class ColumnBuffer:
     """The columns of many parts, joined as they come; views of one value stay views."""
 
     def __init__(self) -> None:
-        self._views: list[npt.NDArray[Any]] = list(_NO_MESSAGE)
-        self._stores: dict[int, mmap.mmap] = {}
+        self._columns: list[npt.NDArray[Any]] = [column.copy() for column in _NO_MESSAGE]
 
     def add(self, part: FieldColumn) -> None:
         """Append a part."""
-        for k, (view, piece) in enumerate(zip(self._views, part)):
-            store = self._stores.get(k)
-            if store is None and piece.size:
-                if not piece.strides[0] and (
-                        not view.size or np.array_equal(view[:1], piece[:1], equal_nan=True)):
-                    self._views[k] = np.broadcast_to(piece[0], view.size + piece.size)
-                    continue
-                store = self._stores[k] = mmap.mmap(-1, mmap.PAGESIZE, mmap.MAP_PRIVATE)
-                _append(store, view)
-            if store is not None:
-                _append(store, piece)
+        for k, (column, piece) in enumerate(zip(self._columns, part)):
+            size = column.size + piece.size
+            if piece.size and not piece.strides[0] and (not column.size or not (
+                    column.strides[0]) and np.array_equal(column[:1], piece[:1], equal_nan=True)):
+                self._columns[k] = np.broadcast_to(piece[0], size)
+            elif piece.size:
+                if not column.flags.owndata:
+                    column = self._columns[k] = column.copy()
+                # A large array grows in place: joining the parts at the end would copy them.
+                column.resize(size, refcheck=False)
+                column[size - piece.size:] = piece
 
     def whole(self) -> FieldColumn:
         """Return all parts as one."""
-        return FieldColumn(*(
-            np.frombuffer(store, view.dtype, store.tell() // view.itemsize)
-            if (store := self._stores.get(k)) else view for k, view in enumerate(self._views)))
-
-
-def _append(store: mmap.mmap, values: npt.NDArray[Any]) -> None:
-    """Write at the end of a map, which grows in place: an array would be copied."""
-    end = store.tell() + values.nbytes
-    if end > len(store):
-        size = end + end // 4
-        try:
-            store.resize(size + -size % _PAGE if end > _LARGE else size)
-        except OSError as error:
-            raise MemoryError(error.strerror) from error
-        if end > _LARGE:
-            # Some kernels have no large pages.
-            with suppress(OSError):
-                store.madvise(mmap.MADV_HUGEPAGE)
-    store.write(np.ascontiguousarray(values))
+        return FieldColumn(*self._columns)
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
