@@ -228,11 +228,6 @@ INTERVALS = 64
 BLOCKS = 64
 # Maximum wait for samples, s; also the maximum delay at shutdown.
 NAP = 0.1
-_CLOCKS: dict[str, int] = {
-    'realtime': time.CLOCK_REALTIME, 'realtime_coarse': time.CLOCK_REALTIME,
-    'monotonic': time.CLOCK_MONOTONIC, 'monotonic_raw': time.CLOCK_MONOTONIC_RAW,
-    'monotonic_coarse': time.CLOCK_MONOTONIC, 'boottime': time.CLOCK_BOOTTIME,
-    'tai': time.CLOCK_TAI}
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,9 +271,12 @@ class IioBuffer:
                              f'(no {self.channel}_scale)')
         self._scale = channel_number(folder, self.channel, 'scale', math.nan)
         self._offset = channel_number(folder, self.channel, 'offset', 0.0)
-        self._elements = self._enable()
-        self._scan = Scan(self._elements)
-        self._clock = self._stamp_clock()
+        elements = self._enable()
+        self._scan = Scan(elements)
+        self._stamped = any(element.name == STAMP for element in elements)
+        clock = folder / 'current_timestamp_clock'
+        if clock.exists() and read_attribute(clock) != 'realtime':
+            write_attribute(clock, 'realtime')
         write_attribute(folder / 'buffer/length', self.block * BLOCKS)
         if (folder / 'buffer/watermark').exists():
             write_attribute(folder / 'buffer/watermark', self.block)
@@ -296,15 +294,6 @@ class IioBuffer:
                 wanted.append(parse_element(name, int(number_of(scan / f'{name}_index')),
                                             read_attribute(scan / f'{name}_type')))
         return wanted
-
-    def _stamp_clock(self) -> int | None:
-        if all(element.name != STAMP for element in self._elements):
-            return None
-        path = self._folder / 'current_timestamp_clock'
-        name = read_attribute(path) if path.exists() else 'realtime'
-        if name not in _CLOCKS:
-            raise InputError(f"{path} is '{name}': only {', '.join(_CLOCKS)} can be used")
-        return _CLOCKS[name]
 
     def _open(self) -> int:
         try:
@@ -352,19 +341,16 @@ class IioBuffer:
     def _decode(self, data: bytes) -> Iterator[Block]:
         now = time.time()
         volts = self._scan.volts(data, self.channel, self._scale, self._offset)
-        if self._clock is None:
+        if not self._stamped:
             yield Block(now, volts, math.nan)
             return
         # Integers: nanoseconds since 1970 exceed the precision of a float.
-        apart = 0 if self._clock == time.CLOCK_REALTIME else (
-            time.time_ns() - time.clock_gettime_ns(self._clock))
-        kernel = self._scan.integers(data, STAMP)
-        stamps = kernel + apart
+        stamps = self._scan.integers(data, STAMP)
         # There is no step before the very first sample.
-        before = int(kernel[0]) if self._newest is None else self._newest
-        steps = np.diff(kernel, prepend=before)
+        before = int(stamps[0]) if self._newest is None else self._newest
+        steps = np.diff(stamps, prepend=before)
         self._intervals += steps[1 if self._newest is None else 0:].tolist()
-        self._newest = int(kernel[-1])
+        self._newest = int(stamps[-1])
         typical = float(np.median(self._intervals)) if self._intervals else math.nan
         holes = np.flatnonzero(steps > HOLE * typical)
         self.holes += holes.size

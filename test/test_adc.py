@@ -84,14 +84,14 @@ def test_samples_lost_between_two_blocks_are_a_hole(tmp_path, block):
     buffer.close()
 
 
-def test_a_monotonic_clock_is_brought_to_1970(tmp_path):
+def test_the_device_stamps_by_the_time_since_1970(tmp_path):
     folder, character = iio_device(tmp_path, clock='monotonic')
+    done = feed(character, scans(np.arange(10), T0 + 100_000 * np.arange(10)))
     buffer = IioBuffer(folder, character, 'in_voltage1', block=10)
-    now = time.time()
-    done = feed(character, scans(np.arange(10), time.monotonic_ns() + 100_000 * np.arange(10)))
+    assert (folder / 'current_timestamp_clock').read_text() == 'realtime\n'
     (block,) = take(buffer, 1)
     done.set()
-    assert block.stamp == pytest.approx(now, abs=5.0)
+    assert block.stamp == pytest.approx(1e-9 * (T0 + 900_000), abs=1e-6)
     buffer.close()
 
 
@@ -127,7 +127,8 @@ def test_a_device_is_found_by_each_of_its_names(tmp_path):
     (lambda f, c: (f / 'buffer/enable').unlink(), 'cannot set .*buffer/enable'),
     (lambda f, c: (f / 'in_voltage_scale').unlink(), 'does not state the scale of in_voltage1'),
     (lambda f, c: (f / 'in_voltage_scale').write_text('much\n'), "holds 'much', not a number"),
-    (lambda f, c: (f / 'current_timestamp_clock').write_text('sundial\n'), 'sundial'),
+    (lambda f, c: ((f / 'current_timestamp_clock').unlink(),
+                   (f / 'current_timestamp_clock').mkdir()), 'cannot read .*timestamp_clock'),
     (lambda f, c: c.unlink(), 'cannot open .*No such file'),
     (lambda f, c: os.rename(f / 'scan_elements', f / 'x'), 'has no buffer')])
 def test_device_errors_name_the_cause(tmp_path, spoil, words):
