@@ -378,46 +378,9 @@ def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: 
         current=None if recording.current is None else recording.current[which])
 
 
-def spread(t: FloatArray, volts: FloatArray) -> FloatArray:
-    """Spread rows with equal stamps evenly, if their number per stamp is steady."""
-    # The first row of a stamp is at the stamp, unless rows are missing before it.
-    known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
-    stamps, change = t[known], np.diff(volts[known])
-    begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
-    step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
-    if step.size and (step < 0.0).all():
-        return spread(t[::-1], volts[::-1])[::-1]
-    if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
-        return t
-    usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Leave the stamps if the voltage changes only at new stamps (repeated rows), or if it always
-    # changes in one direction there (several series in turn).
-    if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
-            first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
-                np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
-                    1.0, _SURE / math.sqrt(first.size)):
-        return t
-    row, even = np.arange(float(known.size)), stamps.copy()
-    pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
-    for part in np.split(begin, pauses):
-        end = begin[begin > part[-1]].min(initial=known.size)
-        # The first and the last stamp may lack rows.
-        x = np.unique(np.append(part[1::_EVEN], part[-1]))
-        rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
-        here = row[part[0]:end]
-        even[part[0]:end] = np.interp(here, x, stamps[x]) + rate * (
-            np.minimum(here - x[0], 0.0) + np.maximum(here - x[-1], 0.0))
-    return t if (np.diff(even) <= 0.0).any() else np.where(
-        np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
-
-
 def ordered(recording: Recording) -> Recording:
     """Return a recording in the order of its stamps, each once; notes count dropped samples."""
     which, said = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE, ' V')
-    if said and (even := spread(recording.t, recording.voltage)) is not recording.t:
-        recording = replace(recording, t=even, notes=(
-            *recording.notes, 'Equal stamps were spread evenly, a guess.'))
-        which, said = in_order(even, recording.voltage[:, None], MOST_VOLTAGE, ' V')
     if said:
         check_stamps(recording.name, recording.t, recording.voltage)
         recording = part_of(recording, which, *said)
@@ -448,12 +411,6 @@ MOST_THROTTLE = 2.0
 _REVERSE = 0.05
 # Maximum share of implausible throttles that are errors of single samples, not another unit.
 WILD = 0.05
-# To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
-# deviation of that number; stamps per straight piece (with ten rows per stamp, one row changes
-# its rate by 1 %).
-_LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
-# Maximum change by rounding, V; standard errors above which a mean change is significant.
-_ROUNDING, _SURE = 1e-6, 4.0
 # Maximum samples in a batch; NumPy's overhead per call is then negligible.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.

@@ -102,19 +102,15 @@ CALLS = {
 
 @pytest.mark.parametrize('call', sorted({*CALLS} - {'coupling'}))
 def test_stamps_in_whole_seconds(call):
-    """200 samples share a stamp: spread as in a CSV, or refused if their number is unsteady."""
+    """200 samples share a stamp: refused, because their times could only be guessed."""
     t = np.arange(6000) / 200.0
     throttle = np.where(t % 2.0 < 1.0, 0.2, 0.5)
     volts = 15.0 - throttle + 0.01 * np.random.default_rng(2).standard_normal(t.size)
+    found = CALLS[call](Recording(t, volts, throttle))
+    fine = getattr(found, 'supply', found)
     dates = np.datetime64('2026-01-01') + t.astype('timedelta64[s]')
-    fine, coarse = (getattr(found, 'supply', found) for found in (
-        CALLS[call](Recording(one, volts, throttle)) for one in (t, dates)))
-    np.testing.assert_allclose(coarse.sag.sag_v, fine.sag.sag_v, atol=0.03)
-    np.testing.assert_allclose(coarse.noise.rms_v, fine.noise.rms_v, rtol=0.02)
-    assert coarse.lowest.time_s == pytest.approx(fine.lowest.time_s, abs=0.01)
-    kept = np.random.default_rng(3).random(t.size) < np.repeat(np.linspace(0.2, 1.0, 30), 200)
     with pytest.raises(InputError, match='share 30 stamps: give finer stamps, or the interval'):
-        CALLS[call](Recording(dates[kept], volts[kept], throttle[kept]))
+        CALLS[call](Recording(dates, volts, throttle))
     # A logger that repeats stamp and reading loses nothing.
     places = np.repeat(np.arange(6000), np.arange(6000) % 7 + 1)
     again = CALLS[call](Recording(t[places], volts[places], throttle[places]))

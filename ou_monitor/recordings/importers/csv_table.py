@@ -33,7 +33,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, Recording, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline import held_words, hold, plausible_stamps, spread, WILD
+from ou_monitor.timeline import check_stamps, held_words, hold, plausible_stamps, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'
@@ -172,6 +172,8 @@ def read(path: Path, request: Request) -> Log:
     header, t = [name for name in table.form.names if name], table.t
     if not t.size:
         raise InputError(f'{path} holds a header and no line below it')
+    if logs.VOLTAGE in table.found:
+        check_stamps(printable(path.name), t, table.found[logs.VOLTAGE][1])
     taken = {column.name: quantity for quantity, (column, _) in table.found.items()}
     series = [Series(column.name, quantity, t, values, '1', 'column', 0)
               for quantity, (column, values) in table.found.items()]
@@ -270,10 +272,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
         _check_one_series(path, form, t, found[logs.VOLTAGE].name, volts, (*time.place, *places))
     t, words = stamps_of(path, t, time, wanted.time_unit is not None,
                          bool(time.place) and holds_clocks(form, time.place[0]))
-    even = spread(t, volts)
-    if not np.array_equal(even, t, equal_nan=True):
-        words += ', equal stamps spread evenly, a guess: --sample-interval'
-    rows, notes = lower_rows(even, volts)
+    rows, notes = lower_rows(t, volts)
     volts, values = volts[rows], [one[rows] for one in values]
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
@@ -301,7 +300,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
             guesses[quantity] += f', mean of {len(several)} motors'
         scaled[quantity] = column, si
     note = _read_note(form, time, found, guesses, wanted)
-    return _Table(form, time, even[rows], scaled, dict(zip(others, values[len(found):])),
+    return _Table(form, time, t[rows], scaled, dict(zip(others, values[len(found):])),
                   [note] * bool(note) + notes)
 
 

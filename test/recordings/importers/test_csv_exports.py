@@ -192,9 +192,10 @@ FORMS = {
     'graphtec_amp': (table(['Sampling interval,100ms', 'AMP settings',
                             'CH,Signal name,Amp,Input,Range,Filter,Span,,Unit',
                             'CH3,U,M,DC,50V,Off,25,-25,V', 'CH4,I,M,DC,50mV,Off,20,-20,A', 'Data',
-                            'Number,Date,Time,us,CH3,CH4,Alarm'],
-                           lambda k: f"{k + 1},{clock(k, '%Y/%m/%d,%H:%M:%S,%f', 0.1)},"
-                                     f'+{V[k]},+{AMPS[k]},LLLL'), 0.1, False, True),
+                            'Number,Date,Time,ms,CH3,CH4,Alarm'],
+                           lambda k: f"{k + 1},{clock(k, '%Y/%m/%d,%H:%M:%S', 0.1)},"
+                                     f'{100 * k % 1000},+{V[k]},+{AMPS[k]},LLLL'), 0.1, False,
+                     True),
     'keithley': (table(['Model,DMM6500', '', 'Index,Reading,Unit,Range Digits,Date,Time,'
                         'Fractional Seconds,Relative Time,Channel'],
                        lambda k: f"{k + 1},{V[k]:.6E},Volt DC,5.5,{clock(k, '%m/%d/%Y')},"
@@ -289,11 +290,6 @@ FORMS = {
         f'{59.7 * (k < 30) + 0.01 * (k % 30):09.6f},{V[k]}')), 0.01, False, False),
     'rostopic_float': (table(['%time,field.data'], lambda k: (
         f'{1715846526000000000 + 10000000 * k},{V[k]}')), 0.01, False, False),
-    # Several rows per stamp of a clock of whole seconds; the first is in part.
-    'arduino_rtc': (table(['Time,Voltage(V),Current(A)'], lambda k: (
-        f"{clock(k + 3, '%H:%M:%S', 0.1)},{V[k]},{AMPS[k]}")), 0.1, False, True),
-    'unix_seconds': (table(['unixtime,voltage,throttle'], lambda k: (
-        f'{1700000000 + (k + 13) // 20},{V[k]},{U[k]}')), 0.05, True, False),
     # Rows are numbered; the name of the time has more words.
     'hoboware': (table(['"Plot Title: pack"', '"#","Date Time, GMT+02:00","Volt, V (LGR S/N: 1)",'
                         '"Host Connected (LGR S/N: 1)"'], lambda k: (
@@ -656,29 +652,6 @@ def test_labels_are_names_only_if_each_row_has_them(tmp_path):
         read_recording(written(tmp_path, rows))
 
 
-@pytest.mark.parametrize('step, atol', [
-    (np.full(900, 0.104), 0.1), (np.where(np.arange(900) == 400, 33.3, 0.1), 0.1),
-    (np.random.default_rng(1).uniform(0.08, 0.12, 900), 0.3), (np.full(900, 1.0 / 101.0), 0.02)])
-def test_rows_that_share_a_stamp_are_spread(step, atol, tmp_path):
-    """A rate that is no multiple of the clock's, a pause, rows that come unevenly."""
-    t = 0.3 + np.cumsum(step)
-    volts = np.round(12.0 + 0.1 * np.random.default_rng(2).standard_normal(t.size), 2)
-    path = written(tmp_path, 'time,U,I\n' + ''.join(
-        f'{clock(int(k), "%H:%M:%S", 1.0)},{u},3\n' for k, u in zip(t, volts)))
-    found = read_recording(path)
-    assert found.n == t.size and 'equal stamps spread evenly, a guess' in found.notes[0]
-    late = (found.t - found.t[0]) - (t - t[0])
-    np.testing.assert_allclose(late, np.median(late), rtol=0.0, atol=atol)
-    log = import_log(path, Request())
-    np.testing.assert_allclose(log.series[0].t, found.t, rtol=0.0, atol=1e-6)
-    # The newest row first.
-    first, *rows = path.read_text().splitlines(keepends=True)
-    path.write_text(first + ''.join(rows[::-1]))
-    again = read_recording(path)
-    np.testing.assert_allclose(again.t, found.t)
-    np.testing.assert_allclose(again.voltage, found.voltage)
-
-
 @pytest.mark.parametrize('stamps, volts', [
     # Rows repeated; at an unsteady number, so that the value changes within a stamp.
     (np.arange(900) // 10, np.repeat(_RNG.normal(12.0, 0.1, 90), 10)),
@@ -691,14 +664,18 @@ def test_other_rows_that_share_a_stamp_are_dropped(stamps, volts, tmp_path):
     assert any('--sample-interval' in note for note in found.notes)
 
 
-def test_stamps_too_coarse_for_the_voltage_are_refused(tmp_path):
-    """A voltage that changes at most rows, an unsteady number of rows each second."""
-    stamps, volts = np.cumsum(_RNG.random(900) < 0.1), _RNG.normal(12.0, 0.1, 900)
+@pytest.mark.parametrize('stamps', [np.arange(900) // 10, np.cumsum(_RNG.random(900) < 0.1)])
+def test_stamps_too_coarse_for_the_voltage_are_refused(stamps, tmp_path):
+    """A clock of whole seconds beside a voltage that changes at most rows, also by `convert`."""
+    volts = _RNG.normal(12.0, 0.1, 900)
     path = written(tmp_path, 'time,U\n' + ''.join(
         f'{clock(int(k), "%H:%M:%S", 1.0)},{u:.3f}\n' for k, u in zip(stamps, volts)))
-    with pytest.raises(InputError, match='900 samples share .* stamps: .*--sample-interval'):
-        read_recording(path)
-    assert read_recording(path, columns=CsvColumns(sample_interval=0.1)).n == 900
+    for read in read_recording, lambda path: import_log(path, Request()):
+        with pytest.raises(InputError, match='900 samples share .* stamps: .*--sample-interval'):
+            read(path)
+    given = CsvColumns(sample_interval=0.1)
+    assert read_recording(path, columns=given).n == 900
+    assert import_log(path, Request(columns=given)).series[0].n == 900
 
 
 @pytest.mark.parametrize('first', ['high', 'low'])
