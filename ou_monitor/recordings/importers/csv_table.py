@@ -53,8 +53,6 @@ _VALUE_NAME = r'_?(?:values?|reading|data|ampl(?:itude)?|wert|messwert)?'
 _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
 # Words in names of columns that are not the supply's voltage.
 _OTHERS = 'axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag'
-# Names that are a voltage only if no other column may be one.
-_SUPPLY_NAME = '(?:[uv]_?)?(?:akku|batt?|pack|supply|rail)|vol|spg'
 _PATTERNS = {
     _TIME_NAME: (
         r'time_s',
@@ -68,7 +66,7 @@ _PATTERNS = {
         r'[uv]_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|'
         r'volts|voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
         r'|v_?bus|vfas|cels|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
-        r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
+        r'u|v|vol|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?|[uv]_1_[uv](?:rms|dc|mean|mn)',
         r'volt(?:age)?_?filtered(?:_v)?|rxbt',
         rf'(?!.*(?:{_OTHERS})).*(?:volt|spannung|vbat).*'),
@@ -422,12 +420,9 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> FileColumn:
     if 'sec' in form.names and (parts := _parts_of_second(form, form.names.index('sec'))):
         return parts
     filled = [] if form.line else _nameless_columns(form)
-    # Take the first column that rises in every row, else the first column if it never falls.
-    rising = [k for k in filled[:len(filled) - 1] if len(form.rows) >= _FEW_ROWS and (
-        np.diff(_times(form, k)) > 0.0).all()] or [k for k in filled[:1] if _rises(form, k)]
-    if len(filled) > 1 and rising:
-        return _parts_of_second(form, rising[0]) or _unit_column(
-            form, rising[0], wanted.time_unit)
+    if len(filled) > 1 and _rises(form, filled[0]):
+        return _parts_of_second(form, filled[0]) or _unit_column(
+            form, filled[0], wanted.time_unit)
     if not math.isfinite(form.step):
         raise InputError(_absent(path, form, TIME, ' (--time-column or --sample-interval)'))
     return FileColumn((), form.stated, 's', form.step)
@@ -471,21 +466,13 @@ def _parts_of_second(form: Form, clock: int) -> FileColumn | None:
 
 
 def _nameless_columns(form: Form) -> list[int]:
-    """Return the columns of numbers; with a header, those that may be a voltage."""
+    """Return the columns of numbers; with a header, only the one beside the time."""
     # An open quote makes one name of a line of names.
     filled = [k for k in range(min(form.width, len(form.names) or form.width)) if form.rows
               and len(form.cells(k)) == len(form.rows) and all(map(is_value, form.cells(k)))]
-    if not form.line:
-        return filled
-    # A column with a general name, if the time is the only other column; or a steady column with
-    # decimals, if there is a throttle or current, or if its name fits a supply.
-    others = {*_choose(form, logs.THROTTLE), *_choose(form, logs.CURRENT)}
-    return [k for k in {*filled[1:]} - others if not form.units[k] and (
-        form.width == 2 and re.fullmatch(_VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])
-        or _range_of(form, k) < 1.0 and any('.' in cell for cell in form.cells(k)) and (
-            others and not re.search(f'{_OTHERS}|rpm|alt|speed|pres|power|energ|rate|acc|gyro',
-                                     form.names[k].lower())
-            or re.fullmatch(_SUPPLY_NAME, _plain_names(form)[k])))]
+    return filled if not form.line else [
+        k for k in filled[1:] if form.width == 2 and not form.units[k] and re.fullmatch(
+            _VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])]
 
 
 def _range_of(form: Form, place: int) -> float:
@@ -493,15 +480,6 @@ def _range_of(form: Form, place: int) -> float:
     # A load changes a supply's voltage by a few percent, and its current by far more.
     found = np.array([number_of(cell)[0] for cell in form.cells(place) if is_number(cell)])
     return float(np.ptp(found) / found.mean()) if found.size and found.min() >= 1.0 else math.inf
-
-
-def _steadiest(form: Form, places: list[int]) -> list[int]:
-    """Return a single place, or, without a header, those that vary if the first varies least."""
-    if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
-        return places if len(places) == 1 else []
-    # Constant columns are not compared.
-    spread = {k: size for k in places if 0.0 < (size := _range_of(form, k)) < 1.0}
-    return list(spread) if spread and min(spread.values()) == next(iter(spread.values())) else []
 
 
 def _times(form: Form, place: int) -> FloatArray:
@@ -561,7 +539,9 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
             # Prefer a voltage that has a current of the same name.
             places.sort(key=lambda k: _stem(form.names[k]) not in currents)
         if not places and quantity == logs.VOLTAGE:
-            places = _steadiest(form, [k for k in _nameless_columns(form) if k not in taken])
+            # Of several columns without a telling name, none is taken.
+            rest = [k for k in _nameless_columns(form) if k not in taken]
+            places = rest if len(rest) == 1 else []
         if places:
             found[quantity] = _unit_column(form, places[0], unit)._replace(guess=guess)
             taken.append(places[0])
@@ -680,9 +660,7 @@ def _read_note(form: Form, time: FileColumn, found: dict[str, FileColumn], units
     parts = [f"time from '{time.name}' ({units[_TIME_NAME]})"]
     parts += [f"{quantity} from '{column.name}' ({units[quantity]})"
               for quantity, column in found.items()]
-    places = _choose(form, logs.VOLTAGE, time.place)[1:3] if form.line else _steadiest(
-        form, [k for k in _nameless_columns(form) if k not in time.place])[:3]
-    others = [form.names[k] for k in places
+    others = [form.names[k] for k in _choose(form, logs.VOLTAGE, time.place)[1:3]
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''
     if lacking:

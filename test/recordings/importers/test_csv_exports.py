@@ -261,13 +261,10 @@ FORMS = {
     'matlab': (table(['Time,Voltage'], lambda k: clock(k, '%d-%b-%Y %H:%M:%S.%f') + f',{V[k]}'),
                0.01, False, False),
     # No names: of the columns beside the time, the first varies least.
-    'serial_monitor': (table([], lambda k: clock(k, '%H:%M:%S.%f') + f' -> {V[k]},{AMPS[k]}'),
+    'serial_monitor': (table([], lambda k: clock(k, '%H:%M:%S.%f') + f' -> {V[k]}'),
                        0.01, False, False),
-    'stamped_lines': (table([], lambda k: f"[{clock(k, '%H:%M:%S.%f')}] {V[k]} {AMPS[k]}"), 0.01,
+    'stamped_lines': (table([], lambda k: f"[{clock(k, '%H:%M:%S.%f')}] {V[k]}"), 0.01,
                       False, False),
-    'ros2_topic_echo': (table([], lambda k: (
-        f'{1700000000 + k // 40},{25000000 * (k % 40)},base_link,{V[k]},nan,{-AMPS[k]},0.9,True')),
-        0.025, False, False),
     'ros2_battery_state': (table([], lambda k: (
         f'{1700000000 + k // 40},{25000000 * (k % 40)},battery,{V[k]},nan,{AMPS[k]},'
         f'{5.2 - 1e-4 * k:.4f},nan,5.2,{1.0 - 2e-5 * k:.5f},2,1,3,True,'
@@ -386,8 +383,6 @@ FORMS = {
     # The same times before each channel.
     'labview_multi': (table(['X_Value\tVoltage\tX_Value\tCurrent\tComment'], lambda k: (
         f'{0.01 * k:.2f}\t{V[k]}\t{0.01 * k:.2f}\t{AMPS[k]}')), 0.01, False, True),
-    'junsi': (table([], lambda k: f'$1;2;{1000 * k};12315;{1e3 * V[k]:.0f};-49;0'), 1.0, False,
-              False),
     'excel_fr_gaz': (table(['Temps (s);Tension batterie (V);Commande gaz (%)'], lambda k: (
         f'{0.01 * k:.2f};{V[k]};{100 * U[k]:.1f}'.replace('.', ','))), 0.01, True, False),
     'scan_my_tesla': (table(['Time,Battery voltage,Accelerator Pedal'], lambda k: (
@@ -414,10 +409,7 @@ FORMS = {
         0.1, True, False),
     'excel_ch': (table(['Zeit (s);U_Akku (mV)'], lambda k: (
         f'{0.1 * k:.1f};' + thousands(1e3 * V[k]).replace('.', "'"))), 0.1, False, False),
-    # One level that is left beside a throttle or has a supply's name; facts beside the first rows.
-    'supply': (table(['t,supply,command'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'), 0.1, False,
-               False),
-    'pwm': (table(['t,B1,pwm'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'), 0.1, True, False),
+    # Facts beside the first rows.
     'micsig': (table(['ProID,Info,,time,Vol.,'], lambda k: (
         f"{('Model,STO1104C', 'Record Length,4000', ',')[min(k, 2)]},,{0.1 * k:.1f},{V[k]},")),
         0.1, False, False),
@@ -529,11 +521,7 @@ def test_fields_of_mavlink_have_its_units(cells, given, volts, amps, tmp_path):
 
 
 def test_a_name_at_the_left_of_each_number_names_its_column(tmp_path):
-    """
-    As in dumps of MAVLink; the number of a column names it too.  A unit is no name.
-
-    If no name tells the voltage, the steadiest column is taken as before.
-    """
+    """As in dumps of MAVLink; the number of a column names it too.  A unit is no name."""
     path = written(tmp_path, table([], lambda k: (
         f'{clock(k)},FD, 0,sys_status_t,load,305,voltage_battery,{1e3 * V[k]:.0f},'
         f'current_battery,{1e2 * AMPS[k]:.0f},errors_count1,0,sig ,Len,43')))
@@ -546,8 +534,6 @@ def test_a_name_at_the_left_of_each_number_names_its_column(tmp_path):
     path = written(tmp_path, table([], lambda k: f'{k},mV,{V[k]},mA,{AMPS[k]}'))
     found = read_recording(path, columns=CsvColumns(voltage='column 3', current='column 5'))
     assert (found.source['voltage'], found.source['current']) == ('column 3', 'column 5')
-    path = written(tmp_path, table([], lambda k: f'{k},{V[k]},armed,{U[k]},state,{k % 3}'))
-    np.testing.assert_allclose(read_recording(path).voltage, V)
 
 
 def test_a_battery_state_without_a_header_keeps_the_sign_of_its_current(tmp_path):
@@ -817,15 +803,6 @@ def test_three_digits_behind_a_quoted_comma_may_be_thousands(tmp_path):
     np.testing.assert_allclose(found.voltage, 16.52 + 1e-3 * np.arange(9))
 
 
-def test_only_likely_voltages_are_listed_beside_the_chosen(tmp_path):
-    """In a table without names a current, or a column of NaN, is not offered."""
-    path = written(tmp_path, ''.join(
-        f'{k / 20} {12.0 + 0.1 * (k % 7)} {0.5 + k % 9} nan {11.0 + 0.2 * (k % 7)}\n'
-        for k in range(40)))
-    note = read_recording(path).notes[0]
-    assert "voltage from 'column 2'" in note and 'also found: column 5 (' in note
-
-
 def test_a_table_is_taken_for_a_supply_if_it_can_be_read(tmp_path):
     """Fleet takes what analyze reads: an oscilloscope's columns without names, too."""
     path = written(tmp_path, ''.join(
@@ -912,13 +889,15 @@ def test_a_time_with_decimals_is_finer_than_a_clock(tmp_path):
     assert read_recording(path).t[0] > 1e9
 
 
-@pytest.mark.parametrize('row', [
-    lambda k: (k, 10.0 + AMPS[k], V[k]), lambda k: (k, k + 1, 2 * k), lambda k: (k, 0.9, U[k])])
-def test_columns_without_names_are_not_mistaken(row, tmp_path):
-    """A column before one that varies less, counters and numbers below 1 are no voltage."""
-    lines = [','.join(map(str, row(k))) for k in range(N)]
-    with pytest.raises(InputError, match='first line holds numbers'):
-        read_recording(written(tmp_path, '\n'.join(lines)))
+@pytest.mark.parametrize('names', ['', 't,supply,command\n', 't,B1,pwm\n'])
+def test_of_several_columns_without_telling_names_none_is_taken(names, tmp_path):
+    """How steady a column is does not make it the voltage; the user can name it."""
+    path = written(tmp_path, names + '\n'.join(f'{0.1 * k:.1f},{V[k]},{U[k]}' for k in range(N)))
+    with pytest.raises(InputError, match="no column 'voltage_v'"):
+        read_recording(path)
+    place = names.split(',')[1] if names else 'column 2'
+    found = read_recording(path, columns=CsvColumns(voltage=place))
+    np.testing.assert_allclose(found.voltage, V)
 
 
 @pytest.mark.parametrize('pause, span', [(0, 0.059), (500000, 4294.9664)])
