@@ -88,8 +88,6 @@ _INTERVAL = re.compile(
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'μ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'g': 1e9, '': 1.0}
 # A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
 _RECEIVED = re.compile(r'\[?(\d\d:\d\d:\d\d[.,]\d+)(?:\]| -?>) *')
-# The name that a serial plotter takes before each number: Voltage:12.3
-_LABEL = re.compile(r'[^\W\d][\w ()%/-]*[:=]')
 
 
 class Form(NamedTuple):
@@ -101,7 +99,6 @@ class Form(NamedTuple):
     mark: str  # Decimal mark if the other one is known to separate thousands, else ''
     skip: int  # Lines above the first row of numbers
     line: int  # Number of the line with the names; 0: there is none
-    labels: tuple[str, ...]  # Words before the numbers of each column, '' if none
     above: str  # The lines above the rows
     names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
     units: tuple[str, ...]  # As stated, '' if not stated
@@ -199,8 +196,6 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
         return None
     width = max(widths, key=lambda size: (widths[size], size))
     full = [row for row in filled if len(row) == width]
-    labels = _labels_of(full)
-    rows, full = ([_unlabelled(row, labels) for row in some] for some in (rows, full))
     good = [[is_value(row[k]) for row in full if row[k]] for k in range(width)]
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
     facts = _end_of_facts(rows, skip)
@@ -210,7 +205,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
         first = len(rows)
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
-    names, words, at = _header(rows, lines, first, width, delimiter, skip, labels, facts > 0)
+    names, words, at = _header(rows, lines, first, width, delimiter, skip, facts > 0)
     if not at and not facts and any(
             len(row) > 2 and all(row) and not any(map(is_value, row))
             for row in rows[skip:first]):
@@ -223,8 +218,8 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     step, stated = _stated_step(list(map(_with_point, above)) if comma else above, rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
-        encoding, delimiter, comma, mark, first, at, labels, ''.join(lines[:first]),
-        tuple(names), _units_of(names, words, rows, first, at), width, first_rows, step, stated)
+        encoding, delimiter, comma, mark, first, at, ''.join(lines[:first]), tuple(names),
+        _units_of(names, words, rows, first, at), width, first_rows, step, stated)
 
 
 def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
@@ -237,13 +232,6 @@ def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[lis
 
 def _trimmed(row: list[str]) -> list[str]:
     return row[:max((k + 1 for k, cell in enumerate(row) if cell), default=0)]
-
-
-def _labels_of(rows: list[list[str]]) -> tuple[str, ...]:
-    """Return the label before each column's number if two rows have the same, else ''."""
-    either = [[found[0] if (found := _LABEL.match(cell)) and is_number(cell[found.end():]) else ''
-               for cell in row] for row in rows[len(rows) // 2:][:2]]
-    return tuple(one if one == other else '' for one, other in zip(either[0], either[-1]))
 
 
 def _end_of_facts(rows: list[list[str]], skip: int) -> int:
@@ -268,12 +256,6 @@ def _first_of_data(rows: list[list[str]], skip: int, width: int, places: list[in
     first = next((k for k in fits if all(numeric[j] for j in islice(
         (j for j in numeric if j >= k), _IN_A_ROW))), fits[0])
     return _after_names(rows, skip, first, width, places)
-
-
-def _unlabelled(row: list[str], labels: Sequence[str]) -> list[str]:
-    """Return cells without the words before their numbers."""
-    return [cell.strip().removeprefix(label).strip() for cell, label in zip(row, labels)] + row[
-        len(labels):] if any(labels) else row
 
 
 def _after_names(rows: list[list[str]], skip: int, first: int, width: int, places: list[int],
@@ -325,7 +307,7 @@ def _with_point(text: str) -> str:
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
-            skip: int, labels: Sequence[str], facts: bool) -> tuple[list[str], list[str], int]:
+            skip: int, facts: bool) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
     # A line of decimal numbers, such as a battery tester's on a charging step, has no names.
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
@@ -336,9 +318,6 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
         plain = sorted(((k, row) for k, row in ((k, _trimmed(row)) for k, row in plain)
                         if len(row) in (width, len(needed) + 1) and _OF_NAMES.search(row[0])
                         and not any(map(is_value, row))), key=lambda one: len(one[1]))[-1:]
-    if any(labels) and not (plain and len(plain[-1][1]) == width):
-        return [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
-                for k, (label, cell) in enumerate(zip(labels, rows[first]))], [], first + 1
     # Otherwise the names may be in a comment: delimited like the data, or by blanks with units in
     # brackets.
     comments = []
@@ -534,8 +513,7 @@ def numbers(path: Path, form: Form, places: Sequence[int],
             for lines, rows in _blocks(path, file, form, width):
                 if len(rows[0]) <= last or len(rows[0]) > width or len(set(map(len, rows))) > 1:
                     lines, rows = _fitting(path, lines, rows, width, last, form, left_out)
-                columns: list[tuple[str, ...]] = list(zip(*(
-                    _unlabelled(row, form.labels) for row in rows)))
+                columns = list(zip(*rows))
                 if not columns:
                     continue
                 good = np.ones(len(rows), dtype=bool)
