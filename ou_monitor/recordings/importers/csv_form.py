@@ -198,15 +198,14 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     full = [row for row in filled if len(row) == width]
     good = [[is_value(row[k]) for row in full if row[k]] for k in range(width)]
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
-    facts = _end_of_facts(rows, skip)
-    first = _first_of_data(rows, max(skip, facts), width, places)
+    first = _first_of_data(rows, skip, width, places)
     if first is None:
         # No rows: accept a header alone.
         first = len(rows)
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
-    names, words, at = _header(rows, lines, first, width, delimiter, skip, facts > 0)
-    if not at and not facts and any(
+    names, words, at = _header(rows, lines, first, width, delimiter, skip)
+    if not at and any(
             len(row) > 2 and all(row) and not any(map(is_value, row))
             for row in rows[skip:first]):
         # The names do not fit the columns: rows have lost or gained cells.
@@ -232,15 +231,6 @@ def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[lis
 
 def _trimmed(row: list[str]) -> list[str]:
     return row[:max((k + 1 for k, cell in enumerate(row) if cell), default=0)]
-
-
-def _end_of_facts(rows: list[list[str]], skip: int) -> int:
-    """Return the blank row that ends a block of named facts; 0: there is no such block."""
-    words = [k for k, row in enumerate(rows) if k >= skip and row and row[0] and not (
-        is_value(row[0]) or is_missing(row[0]))]
-    end = words[-1] + 1 if len(words) > _IN_A_ROW else 0
-    return end if end and end + _IN_A_ROW < len(rows) and not any(rows[end]) and any(
-        map(is_value, rows[end - 1])) else 0
 
 
 def _first_of_data(rows: list[list[str]], skip: int, width: int, places: list[int]) -> int | None:
@@ -307,17 +297,12 @@ def _with_point(text: str) -> str:
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
-            skip: int, facts: bool) -> tuple[list[str], list[str], int]:
+            skip: int) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
     # A line of decimal numbers, such as a battery tester's on a charging step, has no names.
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
         '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
     needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
-    if facts:
-        # One of the facts holds the names of the columns: the longest, or the last of equal ones.
-        plain = sorted(((k, row) for k, row in ((k, _trimmed(row)) for k, row in plain)
-                        if len(row) in (width, len(needed) + 1) and _OF_NAMES.search(row[0])
-                        and not any(map(is_value, row))), key=lambda one: len(one[1]))[-1:]
     # Otherwise the names may be in a comment: delimited like the data, or by blanks with units in
     # brackets.
     comments = []

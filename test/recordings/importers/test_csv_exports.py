@@ -313,14 +313,7 @@ FORMS = {
     # Castle: pulses in ms; EdgeTX: the pack beside the receiver.
     'castle': (table(['Seconds,Throttle (ms),Voltage (v),Current (A)'], lambda k: (
         f'{0.1 * k:.1f},{1.0 + U[k]:.3f},{V[k]},{AMPS[k]}')), 0.1, True, True),
-    # Yokogawa: facts end at a blank line and hold the names; GW Instek: they end with a title.
-    'yokogawa': (table(
-        ['"Header Size",15', '"Model Name","DLM3054"', '"Comment",""', '"BlockNumber",1',
-         '"TraceName","U_BAT   ","I_BAT   "', f'"BlockSize",{N},{N}', '"VUnit","V","A"',
-         '"SampleRate",1.0E+03,1.0E+03', '"HResolution",1.0E-03,1.0E-03', '"HUnit","s","s"',
-         f'"DisplayBlockSize",{N},{N}', '"DisplayPointNo.",1,1',
-         '"Date","2024/06/18","2024/06/18"', '"Time","14:22:07.510","14:22:07.510"', ''],
-        lambda k: f', {V[k]:.7E}, {AMPS[k]:.7E}'), 1e-3, False, True),
+    # GW Instek: facts end with a title.
     'gwinstek_title': (table(
         ['Format,1.0B', 'Source,CH1', 'Vertical Units,V', 'Sampling Period,4.000E-04',
          'Horizontal Old Scale,5.000E-03', 'Mode,Detail', 'Waveform Data'],
