@@ -86,8 +86,6 @@ _INTERVAL = re.compile(
     re.IGNORECASE)
 # A prefix of units, in any letter case except for m and M.
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'μ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'g': 1e9, '': 1.0}
-# A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
-_RECEIVED = re.compile(r'\[?(\d\d:\d\d:\d\d[.,]\d+)(?:\]| -?>) *')
 
 
 class Form(NamedTuple):
@@ -278,10 +276,6 @@ def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[
     """Return lines with decimal points, without comments, and with single blanks as delimiters."""
     lines = ['\n' if line.lstrip().startswith(COMMENTS) else line
              if line.isascii() and "'" not in line else _BLANK.sub('', line) for line in lines]
-    if lines and _RECEIVED.match(lines[0]):
-        lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
-            delimiter in (rest := line[found.end():]).strip() or ' ' not in rest.strip())
-            else line for line in lines]
     if mark:
         groups, between = (_OF_POINT, '.') if mark == ',' else (
             _OF_QUOTED if delimiter == ',' else _OF_COMMA, ',')

@@ -263,8 +263,6 @@ FORMS = {
     # No names: of the columns beside the time, the first varies least.
     'serial_monitor': (table([], lambda k: clock(k, '%H:%M:%S.%f') + f' -> {V[k]}'),
                        0.01, False, False),
-    'stamped_lines': (table([], lambda k: f"[{clock(k, '%H:%M:%S.%f')}] {V[k]}"), 0.01,
-                      False, False),
     'ros2_battery_state': (table([], lambda k: (
         f'{1700000000 + k // 40},{25000000 * (k % 40)},battery,{V[k]},nan,{AMPS[k]},'
         f'{5.2 - 1e-4 * k:.4f},nan,5.2,{1.0 - 2e-5 * k:.5f},2,1,3,True,'
