@@ -19,6 +19,7 @@ import logging
 import multiprocessing
 from multiprocessing.connection import Connection
 import os
+from pathlib import Path
 import resource
 import signal
 import threading
@@ -27,7 +28,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.mcap_file import usable_memory
 
 # Several processes are slower with several threads of linear algebra each than with one each.
 _ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
@@ -48,6 +48,17 @@ def usable_cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
         os.cpu_count() or 1)
+
+
+def usable_memory() -> int:
+    """Return the smallest memory limit of machine, control group and process, bytes."""
+    limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
+    for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
+        # The file may be missing, or hold the word "max".
+        with suppress(OSError, ValueError):
+            limits.append(int(Path(file).read_text(encoding='ascii')))
+    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return min(limits if allowed == resource.RLIM_INFINITY else [*limits, allowed])
 
 
 class Workers:

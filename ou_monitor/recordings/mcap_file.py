@@ -22,7 +22,6 @@ import io
 import math
 import os
 from pathlib import Path
-import resource
 import struct
 from typing import Any, BinaryIO, NamedTuple
 import zlib
@@ -76,11 +75,11 @@ _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
 # Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024
 
-# Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
-# zeros.
+# Limit of an unpacked chunk, bytes: rosbag2's hold 0.8 MB, or one message.
+_MOST_OF_CHUNK = 64 * 1024 * 1024
+# Maximum ratio of all unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000
+# for zeros.
 _MOST_RATIO = 256
-# Limit of an unpacked chunk, bytes: at least the first number, at most memory / the second.
-_LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 
 
 class Damage(Exception):
@@ -109,22 +108,6 @@ class Topic(NamedTuple):
     type: str  # noqa: A003
     schema: Any
     sample_rate: float | None  #: Rate of the samples within a block, Hz
-
-
-def usable_memory() -> int:
-    """Return the smallest memory limit of machine, control group and process, bytes."""
-    limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
-    for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
-        # The file may be missing, or hold the word "max".
-        with suppress(OSError, ValueError):
-            limits.append(int(Path(file).read_text(encoding='ascii')))
-    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return min(limits if allowed == resource.RLIM_INFINITY else [*limits, allowed])
-
-
-def _chunk_limit(size: int) -> int:
-    """Return the bytes that a chunk of a file of `size` bytes may unpack to."""
-    return max(_LEAST_LIMIT, min(_MOST_RATIO * size, usable_memory() // _CHUNKS_AT_ONCE))
 
 
 def _over_limit(what: str, length: int, limit: int) -> str:
@@ -168,8 +151,7 @@ class McapFile:
         self._zstd = zstandard.ZstdDecompressor()
         with opened(self.path) as file:
             self._size = file.seek(0, os.SEEK_END)
-            self._limit = _chunk_limit(self._size)
-            self._limit_of_all = max(16 * self._limit, _MOST_RATIO * self._size)
+            self._limit_of_all = max(16 * _MOST_OF_CHUNK, _MOST_RATIO * self._size)
             if self._size == 0:
                 raise InputError(f'{self.path} is empty (0 bytes)')
             file.seek(0)
@@ -207,7 +189,7 @@ class McapFile:
         if start == 0:
             return None
         try:
-            if not len(MAGIC) < start < self._size or self._size - start > self._limit:
+            if not len(MAGIC) < start < self._size or self._size - start > 16 * _MOST_OF_CHUNK:
                 raise Damage(f'it should begin at byte {start}')
             file.seek(start)
             if stated and _crc(file, self._size - start - len(MAGIC) - 4) != stated:
@@ -295,13 +277,13 @@ class McapFile:
                                     'wrong: something in it was changed')
                 elif op in (Opcode.SCHEMA, Opcode.CHANNEL):
                     if in_data:
-                        self._learn(op, self._content(file, length, self._limit))
+                        self._learn(op, self._content(file, length, _MOST_OF_CHUNK))
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
                 elif op in _UNREAD and statistics is None and not (
                         self.spans and self.spans[-1].chunk):
                     # Without a count of messages, check that a damaged opcode hides none.
-                    _parse(_UNREAD[op], self._content(file, length, self._limit))
+                    _parse(_UNREAD[op], self._content(file, length, _MOST_OF_CHUNK))
                 elif op >= _PRIVATE and statistics is None and not private:
                     private = True
                     raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
@@ -420,8 +402,8 @@ class McapFile:
 
     def _walk_messages(self, file: BinaryIO, at: int, end: int) -> int:
         """Count messages outside of chunks, the first from `at` to `end`; return their end."""
-        if end - at > self._limit:
-            raise Damage(_over_limit('a message has', end - at, self._limit))
+        if end - at > _MOST_OF_CHUNK:
+            raise Damage(_over_limit('a message has', end - at, _MOST_OF_CHUNK))
         file.seek(at)
         data = file.read(max(end - at, _BLOCK))
         places, _, length = _records(data, messages_only=True)
@@ -449,8 +431,8 @@ class McapFile:
 
     def _data(self, file: BinaryIO, span: Span) -> bytes:
         """Return the records of a span, unpacked and with its checksum verified."""
-        if not 0 <= span.length <= self._limit:
-            raise Damage(_over_limit('it has', span.length, self._limit))
+        if not 0 <= span.length <= _MOST_OF_CHUNK:
+            raise Damage(_over_limit('it has', span.length, _MOST_OF_CHUNK))
         file.seek(span.offset)
         content = file.read(span.length)
         if len(content) < span.length:
@@ -465,8 +447,8 @@ class McapFile:
             raise Damage('it is shorter than its own head') from error
         if packed != len(content) - begin:
             raise Damage(f'it holds {len(content) - begin} bytes in place of {packed}')
-        if stated > self._limit:
-            raise Damage(_over_limit('it unpacks to', stated, self._limit))
+        if stated > _MOST_OF_CHUNK:
+            raise Damage(_over_limit('it unpacks to', stated, _MOST_OF_CHUNK))
         try:
             data = _decompressed(content[_CHUNK.size:begin - 8].decode('latin-1'),
                                  memoryview(content)[begin:], stated, self._zstd)

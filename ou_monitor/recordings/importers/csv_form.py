@@ -297,8 +297,7 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
         '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
     needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
-    # Otherwise the names may be in a comment: delimited like the data, or by blanks with units in
-    # brackets.
+    # The names may be in a comment: delimited like the data, or by blanks with units in brackets.
     comments = []
     for k in (k for k in range(skip, first) if lines[k].lstrip().startswith(COMMENTS)):
         text = lines[k].lstrip('#% \t')
