@@ -69,7 +69,7 @@ _PATTERNS = {
         r'u|v|vol|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?|[uv]_1_[uv](?:rms|dc|mean|mn)',
         r'volt(?:age)?_?filtered(?:_v)?|rxbt',
-        rf'(?!.*(?:{_OTHERS})).*(?:volt|spannung|vbat).*'),
+        rf'(?!.*(?:{_OTHERS})).*(?:volt|spannung|vbat).*', r'[uv]?_?(?:akku|supply|rail)|spg'),
     logs.THROTTLE: (
         r'throttle|(?:.*_)?actuator_motors(?:_\d+)?_control_0+',
         r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|(?:commande_)?ga[sz]|'

@@ -874,7 +874,7 @@ def test_a_time_with_decimals_is_finer_than_a_clock(tmp_path):
     assert read_recording(path).t[0] > 1e9
 
 
-@pytest.mark.parametrize('names', ['', 't,supply,command\n', 't,B1,pwm\n'])
+@pytest.mark.parametrize('names', ['', 't,source,command\n', 't,B1,pwm\n'])
 def test_of_several_columns_without_telling_names_none_is_taken(names, tmp_path):
     """How steady a column is does not make it the voltage; the user can name it."""
     path = written(tmp_path, names + '\n'.join(f'{0.1 * k:.1f},{V[k]},{U[k]}' for k in range(N)))
@@ -883,6 +883,13 @@ def test_of_several_columns_without_telling_names_none_is_taken(names, tmp_path)
     place = names.split(',')[1] if names else 'column 2'
     found = read_recording(path, columns=CsvColumns(voltage=place))
     np.testing.assert_allclose(found.voltage, V)
+
+
+@pytest.mark.parametrize('name', ['supply', 'Rail', 'Akku', 'U_Akku'])
+def test_a_column_named_after_the_supply_is_its_voltage(name, tmp_path):
+    path = written(tmp_path, table(
+        [f't,{name},command'], lambda k: f'{0.1 * k:.1f},{V[k]},{U[k]}'))
+    np.testing.assert_allclose(read_recording(path).voltage, V)
 
 
 @pytest.mark.parametrize('pause, span', [(0, 0.059), (500000, 4294.9664)])
