@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from importlib import import_module
 import json
 import math
+import os
 from pathlib import Path
 import sys
 from typing import Any, NoReturn
 
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.run import loaded, run, run_node, spin
+from ou_monitor.stream.files import write_whole
 
 LIFECYCLE = '--lifecycle'
 _DESCRIBED = "'ros2 param describe' explains each parameter and gives its range"
@@ -118,6 +120,12 @@ def replay_options(arguments: list[str]) -> argparse.Namespace:
         raise InputError(f'--clock must lie within 0..10000 Hz, got {found.clock}')
     if not 0.0 <= found.wait < math.inf:
         raise InputError(f'--wait must be 0 or more seconds, got {found.wait}')
+    if found.json not in (None, '-'):
+        file = Path(found.json)
+        if os.path.lexists(file):
+            raise InputError(f"--json '{file}' exists already: give another name")
+        if not file.parent.is_dir():
+            raise InputError(f"--json '{file}': there is no folder '{file.parent}'")
     return found
 
 
@@ -136,10 +144,7 @@ def _replay() -> int:
     if chosen.json == '-':
         print(json.dumps(summary))
     elif chosen.json:
-        try:
-            Path(chosen.json).write_text(json.dumps(summary) + '\n', encoding='utf-8')
-        except OSError as error:
-            raise InputError(f"cannot write --json '{chosen.json}': {error.strerror}") from error
+        write_whole(Path(chosen.json), f'{json.dumps(summary)}\n'.encode(), over=False)
     return 0
 
 

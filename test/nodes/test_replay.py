@@ -1,6 +1,7 @@
 """The real replay: spacing, rate, loop, clock, reading ahead, and refused input."""
 
 import json
+import shutil
 import threading
 import time
 
@@ -220,6 +221,25 @@ def test_bad_bags_are_refused_with_the_reason(tmp_path, arguments, words):
 def test_options_that_are_refused(arguments, words):
     with pytest.raises(InputError, match=words):
         replay_options(arguments)
+
+
+def test_no_file_is_overwritten_by_a_summary(world, tmp_path):
+    """Neither another one's nor one of the bag, and nothing is played."""
+    notes, bag = tmp_path / 'notes.txt', shutil.copytree(BAG, tmp_path / 'bag')
+    notes.write_text('of somebody else')
+    for path in (notes, bag / 'metadata.yaml'):
+        before = path.read_bytes()
+        process = world.start('replay', bag, '--wait', '0', '--json', path)
+        assert process.wait() == 2 and 'exists already: give another name' in process.err
+        assert path.read_bytes() == before
+    with pytest.raises(InputError, match='there is no folder'):
+        replay_options(['bag', '--json', str(tmp_path / 'none' / 'x.json')])
+
+
+def test_a_summary_is_written_to_a_new_file(world, tmp_path, numbered):
+    process = world.start('replay', numbered, '--wait', '0', '--json', tmp_path / 'new.json')
+    assert process.wait() == 0
+    assert json.loads((tmp_path / 'new.json').read_text())['messages'] > 0
 
 
 def test_types_that_are_not_installed_are_left_out(world, tmp_path):
