@@ -112,7 +112,7 @@ class _Table(NamedTuple):
     """The data read from a file, in SI units."""
 
     form: Form
-    time: FileColumn  # Without a place if rows name their series
+    time: FileColumn  # Without a place if only the interval is stated
     t: FloatArray
     found: dict[str, tuple[FileColumn, FloatArray]]  # By quantity
     named: dict[str, FloatArray]  # Other requested columns, as written
