@@ -299,14 +299,15 @@ def test_a_gap_after_a_low_sample_is_not_time_below():
 @pytest.mark.parametrize('step', [0.02, 0.2])
 def test_a_current_that_throttle_does_not_tell_gives_the_fall(step):
     """Of its largest value that lasts three readings, not of one wild reading."""
-    rng, n = np.random.default_rng(2), 4000
+    rng, n = np.random.default_rng(2), 2000
     drawn = np.repeat(rng.uniform(0.0, 60.0, n // 10), 10)
     drawn[1000] = 500.0
     v = 12.0 - 0.02 * drawn + 0.005 * rng.standard_normal(n)
     v[1000] = 12.0
     throttle = np.repeat(rng.uniform(0.0, 1.0, n // 10), 10)
     found = overview(Recording(step * np.arange(n), v, throttle, current=drawn))
-    assert 59.0 < found.drawn < 60.0
+    # The largest of 200 values lies below 58.5 with a chance of 0.6 %.
+    assert 58.5 < found.drawn < 60.0
     ohm = found.facts.resistance.ohm
     assert ohm == pytest.approx(0.02, rel=0.1)
     assert f'lowers the rail by {ohm * found.drawn:.2f} V' in answers(found)[1]
@@ -381,11 +382,12 @@ def test_one_loud_throttle_is_no_trend(last):
     assert dict(known_lines(found))['Noise'].endswith('without a trend over throttle')
 
 
-@pytest.mark.parametrize('growth, least, most', [(0.0, 0, 3), (2.0, 20, 20)])
-def test_noise_grows_only_beyond_its_scatter(growth, least, most):
-    """20 packs read at 10 Hz, whose steps of throttle leave more residuals at some throttles."""
+@pytest.mark.parametrize('growth, packs, least, most', [(0.0, 20, 0, 3), (2.0, 6, 6, 6)])
+def test_noise_grows_only_beyond_its_scatter(growth, packs, least, most):
+    """Packs read at 10 Hz, whose steps of throttle leave more residuals at some throttles."""
+    # Growth that is seen in half of the packs is seen in all 6 of them once in 64.
     said = 0
-    for seed in range(20):
+    for seed in range(packs):
         t, v, u = flown(seed, seconds=120.0, noise=0.0)
         rng = np.random.default_rng(seed + 999)
         v = v + 0.02 * (1.0 + growth * u) * rng.standard_normal(t.size)
@@ -395,16 +397,16 @@ def test_noise_grows_only_beyond_its_scatter(growth, least, most):
 
 
 def test_rounding_is_no_relaxation_in_the_answer():
-    """Of 8 packs with white noise, rounded to 0.2 V, most seem to relax, by less than 58 mV."""
+    """Of 4 packs with white noise, rounded to 0.2 V, most seem to relax, by less than 58 mV."""
     seem = 0
-    for seed in range(8):
+    for seed in range(4):
         t, v, u = flown(seed, seconds=70.0, noise=0.02)
         found = analyze(Recording(t, 0.2 * np.rint(5.0 * v), u))
         relaxes = found.overview.facts.ou.status == 'ok'
         assert ('rounding' in dict(known_lines(found.overview))['Relaxation']) == relaxes
         assert not any('relaxes in' in one for one in answer(found))
         seem += relaxes
-    assert seem >= 4
+    assert seem >= 2
 
 
 def test_unknown_facts_are_stated_and_the_others_kept():

@@ -34,8 +34,9 @@ QUICK = ('measurement_noise', 'quantization', 'held_samples', 'saturation', 'res
          'ac_coupling', 'jumps', 'heavy_tails', 'glitches', 'clock_jitter')
 # Effects of seconds and throttle: named alone at 500 Hz as at 1 kHz with each of two base seeds.
 # Transients and switching are not.
-SLOW = ('load_sag', 'load_dependent_sigma', 'load_dependent_alpha', 'load_dependent_noise',
-        'drift', 'second_relaxation', 'throttle_tone', 'volatility', 'flicker_noise')
+SLOW = (*WHOLE, 'load_sag', 'load_dependent_sigma', 'load_dependent_alpha',
+        'load_dependent_noise', 'drift', 'second_relaxation', 'throttle_tone', 'volatility',
+        'flicker_noise')
 # A count fails if it is less probable than this at the required level.
 RARE = 0.01
 TRIES = 3

@@ -91,15 +91,16 @@ def test_an_effect_hidden_in_a_flight_is_named_beside_its_sag(effect):
     SwitchingLevels(1.0, 1.0, 0.07, 1.0, 1.0, 2.0), None])
 def test_events_are_found_beside_a_wandering_sigma(event):
     """In eight of ten such rails, and no events where there are none."""
+    # Two of three are right with 90 % at that rate, and with 3 % where one in ten is.
     t = 0.005 * np.arange(3000)
     events = () if event is None else (event,)
     rail = SupplyModel((
         OU(20.0, 0.06, 12.0), MeasurementNoise(0.01), Volatility(0.4, 4.0), *events))
     right = {term.NAME for term in rail.terms[1:]}
     found = []
-    for seed in range(4):
+    for seed in range(3):
         voltage = rail.simulate(t, np.random.default_rng(seed))
         found.append({cause.name for cause in discover(Recording(t, voltage)).causes})
-        if found.count(right) == 3:
+        if found.count(right) == 2:
             return
     pytest.fail(str(found))

@@ -110,8 +110,8 @@ def test_no_recorded_source_is_called_stuck():
             continue
         recording = recorded(path)
         watch = ConstantReading()
-        for k in range(0, min(recording.n, 20_000), 7):
-            part = slice(k, k + 7)
+        for k in range(0, min(recording.n, 20_000), 29):
+            part = slice(k, k + 29)
             watch.push(recording.t[part], recording.voltage[part], recording.throttle[part])
             # An INAV, a Crazyflie and a thrust stand take up to 60 readings to the first change.
             assert not watch.why or k < 60, (path.name, recording.t[k], watch.why)

@@ -44,7 +44,7 @@ def test_a_simulated_pack_is_recovered():
     assert loads.load() == load
 
 
-@pytest.mark.parametrize('lag', [0.0, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0])
+@pytest.mark.parametrize('lag', [0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 def test_a_lag_of_any_length_is_in_the_sag(lag):
     """0.9 V that lag by 0 to 10 s: the interval holds the sag after a second."""
     # A sag two errors off is outside of half of the intervals, and in all six of a lag with 1/64.
@@ -339,7 +339,7 @@ def moving_stick(seed, seconds, hold, low, high):
 @pytest.mark.parametrize('sag', [0.2, 2.0])
 def test_motors_that_are_armed_change_the_sag_at_once(sag):
     """The stick moves for 60 s with the motors off: 20 s after arming, the sag is known."""
-    for seed in range(4):
+    for seed in range(2):
         t, u, noise = moving_stick(seed, 80.0, 2.0, 0.1, 0.9)
         load = loaded(t, 16.0 - sag * (t > 60.0) * u ** 1.8 + 0.01 * noise, u)
         assert load.known
@@ -349,7 +349,7 @@ def test_motors_that_are_armed_change_the_sag_at_once(sag):
 
 def test_a_small_sag_of_a_rail_is_known():
     """50 mV in noise of 3 mV: a drift of 2 % of a pack's usual sag would hide it."""
-    for seed in range(4):
+    for seed in range(2):
         t, u, noise = moving_stick(seed, 120.0, 3.0, 0.0, 1.0)
         load = loaded(t, 12.0 - 0.05 * u + 0.003 * noise, u)
         assert load.known
@@ -370,7 +370,7 @@ def test_a_short_climb_keeps_the_sag_known():
 def test_the_fall_of_an_emptying_pack_is_no_sag():
     """Packs that lose 0.2 to 0.7 V a cell at their end: half of the sags were off by half."""
     errors = []
-    for seed in range(10):
+    for seed in range(7):
         rng = np.random.default_rng(seed)
         cells, t = int(rng.choice([1, 3, 4, 6])), np.arange(0.0, 100.0, 0.02)
         u = np.repeat(rng.uniform(0.05, 0.85, 300), rng.integers(20, 150, 300))[:t.size]
