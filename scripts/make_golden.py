@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """
-Write the golden tables: `scripts/make_golden.py [NAME or RUN ...]` (default: all).
+Write the golden tables: `scripts/make_golden.py [NAME or RUN ...]` (default: those there are).
 
 test/analysis/golden/NAME.json is the output of `ou-monitor analyze bags/NAME --json -`, with only
 every sixteenth value of long series; test/golden/RUN.json is the result of a run of
@@ -68,7 +68,7 @@ def main(argv: list[str]) -> int:
     import golden_parts
     import golden_runs
     runs = {**golden_runs.RUNS, **golden_models.RUNS, **golden_parts.RUNS}
-    bags = sorted(path.parent.name for path in BAGS.glob('*/truth.yaml'))
+    bags = sorted(path.stem for path in GOLDEN.glob('*.json'))
     for name in argv or [*bags, *runs]:
         found = runs[name]() if name in runs else table(
             analyze(read_recording(BAGS / name)))

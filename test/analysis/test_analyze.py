@@ -26,29 +26,6 @@ from simulated_recordings import ALPHA, recording, without_throttle
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 
 
-def test_two_levels_are_recovered():
-    """Throttle, mean, sigma, alpha and Var_inf of both, within 4 standard errors."""
-    # With T = 10 s: ln alpha and ln Var_inf scatter by sqrt(2/(alpha T)) = 5.6 %, the mean by
-    # sqrt(2 Var_inf/(alpha T)), ln sigma by about 1/sqrt(2n) = 0.7 % (n = 10000) where white noise
-    # is known, and twice that where it is not. The two sigmas are a factor 2 apart: mixing levels
-    # would be seen.
-    found = analyze(recording(1, TRUTH)).levels
-    assert [level.throttle for level in found] == pytest.approx([0.1, 0.4])
-    for level, (throttle, sigma) in zip(found, TRUTH):
-        e = level.estimate
-        var_inf = sigma ** 2 / (2.0 * ALPHA)
-        scatter = math.sqrt(2.0 / (ALPHA * 10.0))
-        assert e.status is Status.OK and level.kind is ProcessType.DIFFUSION
-        assert abs(math.log(e.sigma / sigma)) < 4.0 * 0.014
-        assert abs(math.log(e.alpha / ALPHA)) < 4.0 * scatter
-        assert abs(math.log(e.var_inf / var_inf)) < 4.0 * scatter
-        assert level.vrms == pytest.approx(math.sqrt(var_inf), rel=2.0 * scatter)
-        assert level.mean == pytest.approx(5.0 - 0.5 * throttle, abs=4.0 * math.sqrt(
-            2.0 * var_inf / (ALPHA * 10.0)))
-        # The largest of about alpha T = 630 independent values of a normal.
-        assert 5.0 < level.crest < 9.0
-
-
 def test_amplitudes_are_those_of_the_samples():
     """Vpp, peak and Vrms of an exact triangle, apart from its offset."""
     t = np.arange(4000) / 1000.0

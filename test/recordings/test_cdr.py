@@ -257,21 +257,6 @@ def read_all(spec, messages, times=None, text=None):
     return reader.read(table_of(messages, times)), broken
 
 
-def shapes(count):
-    """Return frames of which no two have texts of one length, and some of one length of bytes."""
-    return [''.join(chr(97 + (k >> b & 1)) for b in range(6)) * (1 + k) for k in range(count)]
-
-
-@pytest.mark.parametrize('frames', [
-    20 * ['', 'base_link', 'bat', 'été'], shapes(40)], ids=['alike', 'unlike'])
-def test_frames_of_any_length(frames):
-    messages = [battery(frame, k + 0.5, (3.7,) * (k % 3), (k, k))
-                for k, frame in enumerate(frames)]
-    column, broken = read_all(BATTERY, messages)
-    assert column.values.tolist() == [k + 0.5 for k in range(len(frames))] and not broken
-    assert_both_ways(BATTERY, SCHEMAS[cdr.BATTERY_STATE], messages)
-
-
 @pytest.mark.parametrize('stamp, counts', [((5, 7), True), ((0, 0), False), ((0, 1), True),
                                            ((-1, 10**9), False)])
 def test_stamps_and_their_absence(stamp, counts):

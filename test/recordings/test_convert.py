@@ -14,7 +14,6 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose, columns_of
-from ou_monitor.recordings.importers.csv_table import CsvColumns
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.read import read_beside, read_recording, read_signal
@@ -167,15 +166,6 @@ def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
             del answers[-1][name]
     assert answers[0] == answers[1] == answers[2]
     assert 'sag' in json.dumps(answers[0])
-
-
-def test_columns_and_units_of_a_csv(tmp_path):
-    path = tmp_path / 'own.csv'
-    path.write_text('when,mv,stick,throttle\n0,5000,0.25,9\n20,4900,0.5,9\n40,4950,0.75,9\n')
-    found = read_recording(path, columns=CsvColumns('when', 'mv', 'stick', 'mV', 'ms'))
-    np.testing.assert_allclose(found.t, [0.0, 0.02, 0.04])
-    np.testing.assert_allclose(found.voltage, [5.0, 4.9, 4.95])
-    np.testing.assert_allclose(found.throttle, [0.25, 0.5, 0.75])
 
 
 @pytest.mark.parametrize('options,words', [

@@ -49,15 +49,6 @@ def test_samples_are_those_of_the_model():
         SAGGING.simulate(t, np.random.default_rng(7), throttle), rtol=0, atol=1e-9)
 
 
-def test_equal_seeds_give_equal_samples():
-    """Another seed gives others; nothing is drawn before it is needed."""
-    def first(seed):
-        return next(simulated(SAGGING, constant(0.2), duration=1e9, rate=1000.0, seed=seed))
-
-    np.testing.assert_array_equal(first(1).voltage, first(1).voltage)
-    assert np.all(first(1).voltage != first(2).voltage)
-
-
 @pytest.mark.parametrize('terms, words', [
     ((OU(63.0, 1e200, 5.0),), 'beyond 1e\\+09 V'), ((OU(63.0, 0.3, 1e300),), 'beyond'),
     ((OU(1e-300, 1e30, 0.0),), 'beyond'),

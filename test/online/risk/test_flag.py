@@ -118,18 +118,6 @@ def test_parameters_do_not_reset_it():
     check(line(flag, [0.0, 0.0], start=2.0), 'c o')
 
 
-@pytest.mark.parametrize('back', [0.01, 5.0, 1e6])
-def test_time_back_is_no_time(back):
-    flag = made(brownout_hold=3.0)
-    flag.update(1000.0, 0.5)
-    assert flag.update(1001.0, 0.0).age == 1.0
-    start = 1001.0 - back
-    state = flag.update(start, 0.0)
-    assert state.level is CRITICAL and state.age == pytest.approx(1.0)
-    assert flag.update(start + 1.9, 0.0).level is CRITICAL
-    assert flag.update(start + 2.1, 0.0).level is OK
-
-
 @pytest.mark.parametrize('risk', [-1e-9, 1.0 + 1e-9, math.inf, -math.inf])
 def test_no_probability_is_refused(risk):
     with pytest.raises(ValueError, match='0..1'):
