@@ -110,7 +110,7 @@ def test_a_relaxation_that_changes_under_load_has_one_name_if_var_inf_stays(slop
 
 def test_a_lagged_sag_under_jittering_throttle_is_found():
     """Throttle trembles: a sag at once explains nothing, and neither does a lag without it."""
-    rng, n, rate = np.random.default_rng(2), 30000, 1000.0
+    rng, n, rate = np.random.default_rng(2), 15000, 1000.0
     throttle = 0.5 + rail(rng, n, 2.0, rate, 0.2)
     voltage = 12.0 + rail(rng, n, 30.0, rate, 0.015, -0.1 * throttle)
     finding = discover(Recording(np.arange(n) / rate, voltage, throttle))

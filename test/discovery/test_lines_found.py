@@ -124,8 +124,8 @@ def test_a_relaxation_is_seen_neither_within_a_step_nor_beyond_the_end(alpha, re
 
 @pytest.mark.parametrize('idle, slope', [(33.0, 60.0), (120.0, -70.0)])
 def test_a_weak_line_that_follows_throttle_is_found(idle, slope):
-    """60 nats in 40 s: under the noise of each second, above it in all of them together."""
-    rng, n, rate = np.random.default_rng(4), 12000, 300.0
+    """60 nats in 20 s: under the noise of each second, above it in all of them together."""
+    rng, n, rate = np.random.default_rng(4), 6000, 300.0
     t = np.arange(n) / rate
     throttle = 0.5 + 0.15 * np.sin(1.9 * t) + 0.2 * np.sin(0.7 * t + 1.0)
     rail = OU(60.0, 0.3, 15.0)
