@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import math
+from string import Template
 
 # Half the width of a 95 % interval of a normal distribution, in standard errors.
 Z95 = 1.959963984540054
@@ -59,6 +60,12 @@ def percent(share: float) -> str:
 def listed(names: Sequence[str]) -> str:
     """Return names as a list in a sentence."""
     return names[0] if len(names) == 1 else ', '.join(names[:-1]) + ' and ' + names[-1]
+
+
+def filled(text: str, load: str) -> str:
+    """Return a text with the name of the load ('none': throttle) for `$load` and `$Load`."""
+    name = 'throttle' if load == 'none' else load
+    return Template(text).safe_substitute(load=name, Load=name.capitalize())
 
 
 def counted(count: int, word: str = 'sample') -> str:

@@ -28,8 +28,8 @@ from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
-    by_load, collinear_note, coupling_note, explain, left_out_note, NO_OTHER,
-    no_relaxation_note, VAGUE, verdict_words)
+    collinear_note, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note, VAGUE,
+    verdict_words)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
 from ou_monitor.model.terms.load_response import LoadTransient, SHORTEST
@@ -107,10 +107,9 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         whole.terms, standard_errors(samples, whole), strict=True))
     done(0.95)
     load = 'current' if math.isfinite(state.full) else 'throttle'
-    causes = tuple(replace(cause, explanation=by_load(cause.explanation, load)) for cause in
-                   _causes(samples, state, left, se, scored, found.search.rivals))
+    causes = _causes(samples, state, left, se, scored, found.search.rivals, load)
     gain, gain_se = gain_of(left.full, plain, scored)
-    unknown = why_unknown(left.full, plain, scored, bool(uncovered))
+    unknown = why_unknown(left.full, plain, scored, load if uncovered else None)
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
     criticism = _criticism(named.before, after)
     growth = growth_of(left.full, plain, scored)
@@ -124,7 +123,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     fall = load_fall(samples, whole.terms)
     against = doubts(whole.terms, dips, recording.duration,
                      float(np.median(samples.step[1:])), larger, fall,
-                     _of_the_path(whole, samples)) if causes else ()
+                     _of_the_path(whole, samples), load) if causes else ()
     verdict = judge([c for c in criticism if c.is_off], len(causes), against)
     done(1.0)
     finding = Finding(
@@ -135,8 +134,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         score=mean_score(left.full.density, scored & left.full.known),
         gain=gain, gain_se=gain_se, shrink=shrink_of(left.full, plain, scored), larger=larger,
         dips=dips, fall=fall,
-        notes=(*state.notes, *(by_load(note, load) for note in _notes(
-            named, whole, dropped, samples, uncovered))),
+        notes=(*state.notes, *_notes(named, whole, dropped, samples, uncovered, load)),
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
         full=state.full, has_throttle=recording.has_throttle, seed=seed)
     return replace(finding, words=verdict_words(
@@ -216,7 +214,8 @@ def _refitted(samples: Samples, terms: Sequence[Term]) -> Composite | None:
 
 
 def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str, Any], ...],
-            scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]) -> tuple[Cause, ...]:
+            scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]], load: str
+            ) -> tuple[Cause, ...]:
     """Return all causes: exact findings first, then the causes that the search named."""
     # The gain of a cause is what the model loses when refitted without it.  If there are many
     # causes of one kind (harmonics of a line), they are left out together and share one gain.
@@ -238,16 +237,17 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
             gain, error = 0.0, 0.0
         shown = with_reach(term, {}, samples)
         found.append(Cause(term, shown, gain, error, 0.0, (),
-                           explain(term, shown, (), True, why), True))
+                           explain(term, shown, (), True, why, load=load), True))
     for k, name in enumerate(left.names):
         worth, index = left.worth[k], position(model, left.names, k)
         why = '' if math.isfinite(worth.gain) else NO_OTHER if worth.less is None else (
-            why_unknown(left.full, worth.less, scored, catalogue()[name].NEEDS_THROTTLE) or VAGUE)
+            why_unknown(left.full, worth.less, scored,
+                        load if catalogue()[name].NEEDS_THROTTLE else None) or VAGUE)
         others = tuple(dict.fromkeys(rivals.get(name, ())))
         term = model.terms[index]
         found.append(Cause(
             term, se[index], worth.gain, worth.error, worth.chance, others,
-            explain(term, se[index], others, False, why, worth.size), False))
+            explain(term, se[index], others, False, why, worth.size, load), False))
     return tuple(found)
 
 
@@ -262,7 +262,7 @@ def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple
 
 
 def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samples,
-           uncovered: int) -> tuple[str, ...]:
+           uncovered: int, load: str) -> tuple[str, ...]:
     """Return notes: withdrawn causes, and undecided questions."""
     notes = [named.failure] if named.failure else []
     for name in dict.fromkeys(dropped):
@@ -272,9 +272,9 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
                      f'{one} was fitted, but did not improve predictions of held-out samples, '
                      'or its size is not determined: left out.')
     if uncovered:
-        notes.append(left_out_note(uncovered, samples.n - uncovered))
+        notes.append(left_out_note(uncovered, samples.n - uncovered, load))
     if model.has('load_sag') and follows_time(samples):
-        notes.append(collinear_note(follows_time(samples), COLLINEAR))
+        notes.append(collinear_note(follows_time(samples), COLLINEAR, load))
     duration = float(samples.t[-1] - samples.t[0])
     ou = model.terms[0]
     assert isinstance(ou, OU)
@@ -303,8 +303,8 @@ def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = (
 
 
 def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
-           larger: bool = False, fall: LoadFall = LoadFall(), more: Sequence[str] = ()
-           ) -> tuple[str, ...]:
+           larger: bool = False, fall: LoadFall = LoadFall(), more: Sequence[str] = (),
+           load: str = 'throttle') -> tuple[str, ...]:
     """Return objections to a model besides its statistics, in words (times in s)."""
     # larger: whether one-step errors of the model are larger than the plain OU's.
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
@@ -314,7 +314,7 @@ def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
                      f'{number(dips.baseline)} times')
     if not fall.fits:
         found.append(f'its voltage falls by {number(fall.explained, 2)} V from low to high '
-                     f'throttle; the readings fall by {number(fall.measured, 2)} V')
+                     f'{load}; the readings fall by {number(fall.measured, 2)} V')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
         found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')

@@ -52,6 +52,25 @@ class Criticism:
         return not self.low <= self.after <= self.high
 
 
+@dataclass(frozen=True)
+class Explanation:
+    """What is said of a cause, or of several terms of one kind that share a gain."""
+
+    meaning: str
+    estimates: tuple[str, ...]  # Of each term
+    more: tuple[str, ...]  # Sentences: how it was found, its gain, what it may be confused with
+    remedy: str
+
+    @property
+    def text(self) -> str:
+        """Return all sentences."""
+        found = [f'{one}.' for one in self.estimates] if len(self.estimates) == 1 else [
+            f'({k}) {one}.' for k, one in enumerate(self.estimates, 1)]
+        return ' '.join(part for part in (
+            self.meaning, f'Estimate{"s" * (len(found) > 1)}:', *found, *self.more, self.remedy)
+            if part)
+
+
 @dataclass(frozen=True, eq=False)
 class Cause:
     """A cause that was named."""
@@ -63,7 +82,7 @@ class Cause:
     gain_se: float
     p_value: float  # See `gain.cause_gain`; 0 for exact findings
     alternatives: tuple[str, ...]  # Causes that this recording cannot separate from it
-    explanation: str
+    explanation: Explanation
     exact: bool  # Found without a model
 
     @property
@@ -212,7 +231,7 @@ class Finding:
                     name: {'at': at, 'factor': factor}
                     for name, (at, factor) in cause.term.factors().items()},
                 'alternatives': list(cause.alternatives),
-                'explanation': cause.explanation} for cause in self.causes],
+                'explanation': cause.explanation.text} for cause in self.causes],
             'extended': {
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
                 'gain_se': self.gain_se, 'errors_shrink': self.shrink,

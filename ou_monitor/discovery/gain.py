@@ -135,10 +135,10 @@ def growth_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> floa
 
 
 def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
-                throttle: bool) -> str:
+                load: str | None) -> str:
     """Return why a gain cannot be measured, in words; empty if it can."""
     count = int((scored & new.known & old.known).sum())
-    return unmeasured_words(BLOCKS, count, throttle) if count < BLOCKS else ''
+    return unmeasured_words(BLOCKS, count, load) if count < BLOCKS else ''
 
 
 def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]

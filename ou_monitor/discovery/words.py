@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
-import re
 from typing import Any
 
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Explanation, Finding, Verdict
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import LARGEST_LOG_SE
-from ou_monitor.text import chance as shown_chance, listed, number, Z95
+from ou_monitor.text import chance as shown_chance, filled, listed, number, Z95
 
 # Explanation of gains and of the errors printed beside them.
 GAIN = ('Gain: log predictive density of samples not used for the fit, in mnat (thousandths of a '
@@ -33,37 +32,37 @@ _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
     ('band', 'the spectrum has too much or too little power in some band'),
     ('line', 'the spectrum has a narrow peak'),
-    ('order line', 'a narrow peak of the spectrum follows throttle'),
+    ('order line', 'a narrow peak of the spectrum follows $load'),
     ('skewness', 'prediction errors are skewed'),
     ('kurtosis', 'prediction errors have tails that are too heavy or too light'),
     ('tails', 'there are too many outliers'),
     ('clustering', 'large errors come in clusters'),
     ('variance time', 'the noise changes with time'),
-    ('variance throttle', 'the noise depends on throttle'),
-    ('variance change', 'the noise rises when throttle changes'),
+    ('variance throttle', 'the noise depends on $load'),
+    ('variance change', 'the noise rises when $load changes'),
     ('variance state', 'the noise depends on the voltage'),
     ('time', 'the mean changes with time'),
-    ('throttle', 'the mean depends on throttle or its changes'),
-    ('state throttle', 'the relaxation depends on throttle'),
+    ('throttle', 'the mean depends on $load or its changes'),
+    ('state throttle', 'the relaxation depends on $load'),
     ('state', 'the restoring force is not proportional to the deviation'),
-    ('growing effect', 'the effect of throttle on the mean changes with time'),
-    ('loop of throttle', 'the mean depends on whether throttle rose or fell before'),
+    ('growing effect', 'the effect of $load on the mean changes with time'),
+    ('loop of throttle', 'the mean depends on whether $load rose or fell before'),
     ('bursts', 'power at some frequencies comes and goes'),
     ('products of three', 'neighbouring errors are dependent beyond their spectrum'),
     ('pairs', 'large errors are followed by related ones'))
 
 
-def plain_words(statistic: str) -> str:
+def plain_words(statistic: str, load: str = 'throttle') -> str:
     """Return what it means that a statistic lies outside its simulated band."""
     fits = [(len(sign), text) for sign, text in _PLAIN if statistic.startswith(sign)]
-    return max(fits)[1] if fits else statistic
+    return filled(max(fits)[1], load) if fits else statistic
 
 
 # Maximum number of values in a printed list.
 _LISTED = 6
 
 
-def parameters(term: Term, se: Mapping[str, Any]) -> str:
+def parameters(term: Term, se: Mapping[str, Any], load: str = 'throttle') -> str:
     """Return the estimates of a term with units and errors; omit unknown and unused parameters."""
     curves = term.factors()
     known = {name: value for name, value in term.values().items()
@@ -77,23 +76,24 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
             shown = with_error(value, se.get(name), positive=term.positive(name))
             found.append(f'{term.label(name)} {shown}' if shown == VAGUE_NUMBER else
                          f'{term.label(name)} = {shown} {term.unit(name)}'.rstrip())
-    found += [f'factor over {input_words(name)} = {curve_text(*curve)}'
+    found += [f'factor over {input_words(name, load)} = {curve_text(*curve)}'
               for name, curve in curves.items()]
     return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '
                                  'plot and --json'] if long else [])])
 
 
 # Inputs of curves in words, by the first word of their name in `Term.factors`.
-_INPUTS = {'fast': 'distance of throttle from its mean over', 'step': 'change of throttle',
-           'slow': 'distance of smoothed throttle from its mean over',
-           'rises': 'rise of throttle within', 'falls': 'fall of throttle within',
+_INPUTS = {'throttle': '$load', 'fast': 'distance of $load from its mean over',
+           'step': 'change of $load',
+           'slow': 'distance of smoothed $load from its mean over',
+           'rises': 'rise of $load within', 'falls': 'fall of $load within',
            'product': 'product of these factors'}
 
 
-def input_words(name: str) -> str:
+def input_words(name: str, load: str = 'throttle') -> str:
     """Return the input of a curve in words."""
     first, *span = name.split()
-    return ' '.join([_INPUTS.get(first, first), *span])
+    return ' '.join([filled(_INPUTS.get(first, first), load), *span])
 
 
 def curve_text(at: Sequence[float], factors: Sequence[float]) -> str:
@@ -128,32 +128,31 @@ def is_vague(value: Any, error: Any) -> bool:
 
 
 def explain(term: Term, se: Mapping[str, Any], alternatives: Sequence[str], exact: bool = False,
-            why: str = '', together: int = 1) -> str:
-    """Return an explanation of a cause: meaning, estimate, why its gain is unknown, remedy."""
+            why: str = '', together: int = 1, load: str = 'throttle') -> Explanation:
+    """Return the explanation of a cause (why: why its gain is unknown)."""
     # If several terms share a row, or no amplitude differs from 0, use the texts of the class.
     unsigned = bool(term.LINEAR) and all(
         abs(getattr(term, name)) < Z95 * (se.get(name) or 0.0) for name in term.LINEAR)
     about = type(term) if together > 1 or unsigned else term
-    parts = [about.MEANING, f'Estimate: {parameters(term, se)}.']
-    if exact:
-        parts.append('The samples themselves show it, without a model.')
+    more = ['The samples themselves show it, without a model.'] if exact else []
     if why:
-        parts.append(f'Its gain cannot be measured on this recording: {why}')
+        more.append(f'Its gain cannot be measured on this recording: {why}')
     elif together > 1:
-        parts.append(f'Its gain is the joint gain of all {together} {term.NAME} terms.')
+        more.append(f'Its gain is the joint gain of all {together} {term.NAME} terms.')
     if alternatives:
-        separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
+        separate = [f'{filled(catalogue()[name].SEPARATED_BY, load)} (for {name})'
                     for name in (term.NAME, *alternatives)]
-        parts.append(f'This recording cannot separate it from {listed(list(alternatives))}. To '
-                     f'separate them: {"; ".join(dict.fromkeys(separate))}.')
-    parts.append(about.REMEDY)
-    return ' '.join(part for part in parts if part)
+        more.append(f'This recording cannot separate it from {listed(list(alternatives))}. To '
+                    f'separate them: {"; ".join(dict.fromkeys(separate))}.')
+    return Explanation(filled(about.MEANING, load), (parameters(term, se, load),), tuple(more),
+                       filled(about.REMEDY, load))
 
 
-def left_out_note(count: int, scored: int) -> str:
+def left_out_note(count: int, scored: int, load: str) -> str:
     """Return the note for samples at a throttle that other blocks do not cover."""
-    return (f'{count} samples are at a throttle that the rest of the recording does not cover, so '
-            f'a model fitted to the rest does not apply. Only the other {scored} are scored.')
+    return filled(
+        f'{count} samples are at a $load that the rest of the recording does not cover, so a '
+        f'model fitted to the rest does not apply. Only the other {scored} are scored.', load)
 
 
 def coupling_note(alpha: float, duration: float, n: int) -> str:
@@ -172,9 +171,9 @@ def no_relaxation_note(step: float) -> str:
             'than the sampling, or the noise comes from the sensor.')
 
 
-def remaining_words(left: Sequence[Criticism]) -> str:
+def remaining_words(left: Sequence[Criticism], load: str) -> str:
     """Return the largest remaining discrepancies, in words."""
-    texts = list(dict.fromkeys(plain_words(c.statistic) for c in left))
+    texts = list(dict.fromkeys(plain_words(c.statistic, load) for c in left))
     return listed(texts[:4]) + ('' if len(texts) <= 4 else f' ({len(texts) - 4} more)')
 
 
@@ -183,10 +182,10 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
     """Return the verdict as sentences: causes, whether simulations pass, gain, refusal."""
     # why: reason for an unknown gain; uncovered: samples at a throttle that other blocks lack.
     if not found.causes:
-        return (by_load(_without_causes(found, dropped, uncovered), found.load),)
+        return (_without_causes(found, dropped, uncovered),)
     order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
     names = list(dict.fromkeys(
-        both_names(cause.name, plain_name(cause.term)) for cause in order))
+        both_names(cause.name, plain_name(cause.term, found.load)) for cause in order))
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
     closer = f'With {"it" if len(names) == 1 else "them"} the simulation ' + (
@@ -194,24 +193,24 @@ def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), un
         'comes closer, but is not yet right' if found.closer else 'does not come closer')
     refused = [f'{found.refused}: trust the named causes, not the fitted values.'
                ] if found.refused else []
-    return tuple(by_load(text, found.load) for text in (
-        f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
-        f'{": ".join([closer, *(["; ".join(doubts)] if doubts else [])])}.',
-        _gain(found, why), *refused))
+    return (f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
+            f'{": ".join([closer, *(["; ".join(doubts)] if doubts else [])])}.',
+            _gain(found, why), *refused)
 
 
 def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int) -> str:
     if found.verdict is Verdict.NO_EFFECT:
         return ('The plain OU reproduces this recording: none of the statistics that can be '
                 'computed at this length deviates.')
-    left = remaining_words(found.remaining)
+    left = remaining_words(found.remaining, found.load)
+    names = [both_names(name, load=found.load) for name in dropped]
     return ('The simulation deviates from the recording, and no known cause explains it: '
             + f'{left}.' + (
-                ' The nearest causes of the catalogue '
-                f'({listed([both_names(name) for name in dropped])}) explain a part.'
-                if dropped else '') + (
-                f' {uncovered} samples are at a throttle that the rest of the recording does not '
-                'cover; this alone may explain the deviation.' if uncovered else ''))
+                f' The nearest causes of the catalogue ({listed(names)}) explain a part.'
+                if dropped else '') + (filled(
+                    f' {uncovered} samples are at a $load that the rest of the recording does not '
+                    'cover; this alone may explain the deviation.', found.load)
+                    if uncovered else ''))
 
 
 def _gain(found: Finding, why: str) -> str:
@@ -231,21 +230,22 @@ def _gain(found: Finding, why: str) -> str:
     return f'On samples not used for the fit, one-step errors {errors} (rms{parts}{whole} in all.'
 
 
-def collinear_note(inflation: float, limit: float) -> str:
+def collinear_note(inflation: float, limit: float, load: str) -> str:
     """Return a note that sag and drift are hard to tell apart."""
-    return ('Throttle changes with time like a staircase or a ramp (variance inflation '
-            f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
-            'apart, so the errors of the response are larger. Return to a low throttle between '
-            'the steps.')
+    return filled('$Load changes with time like a staircase or a ramp (variance inflation '
+                  f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
+                  'apart, so the errors of the response are larger. Return to a low $load between '
+                  'the steps.', load)
 
 
-def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
+def unmeasured_words(fewest: int, scored: int, load: str | None) -> str:
     """Return why a gain cannot be measured, and which recording would measure it."""
+    # load: None if the load is not the reason.
     few = (f'only {scored} samples can be scored, fewer than {fewest}' if scored
            else 'no part of the recording can be scored with parameters from the other parts')
-    if throttle:
-        return (f'{few}: the parts cover different ranges of throttle. A recording that covers '
-                'its whole range of throttle more than once would measure it.')
+    if load:
+        return filled(f'{few}: the parts cover different ranges of $load. A recording that covers '
+                      'its whole range of $load more than once would measure it.', load)
     return f'{few}. A longer recording would measure it.'
 
 
@@ -262,7 +262,7 @@ class CauseRow:
     explanation: str  # With the parameters of each term
 
 
-def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
+def cause_rows(causes: Sequence[Cause], load: str = 'throttle') -> list[CauseRow]:
     """Return the rows of the table of causes."""
     # Compare numbers as text, because NaN is not equal to itself.
     groups: dict[tuple[str, ...], list[Cause]] = {}
@@ -270,12 +270,14 @@ def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
         key = (cause.name, repr(cause.gain), repr(cause.gain_se), _chance(cause))
         groups.setdefault(key, []).append(cause)
     return [CauseRow(
-        plain_name(group[0].term),
+        plain_name(group[0].term, load),
         group[0].name if len(group) == 1 else f'{group[0].name} x{len(group)}',
         group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
         _chance(group[0]),
         tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
-        _explanation(group)) for group in groups.values()]
+        replace(group[0].explanation, estimates=tuple(
+            one for cause in group for one in cause.explanation.estimates)).text)
+        for group in groups.values()]
 
 
 def gain_text(gain: float, gain_se: float) -> str:
@@ -295,19 +297,6 @@ def _chance(cause: Cause) -> str:
     return shown_chance(cause.p_value) if math.isfinite(cause.p_value) else NOT_KNOWN
 
 
-def _explanation(group: Sequence[Cause]) -> str:
-    """Return the explanation of the first cause, with the estimates of all causes."""
-    first = group[0]
-    if len(group) == 1:
-        return first.explanation
-    own = f'Estimate: {parameters(first.term, first.se)}.'
-    every = 'Estimates: ' + ' '.join(
-        f'({k}) {parameters(cause.term, cause.se)}.' for k, cause in enumerate(group, 1))
-    if own not in first.explanation:
-        return f'{first.explanation} {every}'
-    return first.explanation.replace(own, every, 1)
-
-
 PLAIN_NAMES = {
     'ac_coupling': 'an AC-coupled instrument',
     'clock_jitter': 'jitter of the time stamps',
@@ -317,11 +306,11 @@ PLAIN_NAMES = {
     'heavy_tails': 'noise with rare large jumps',
     'held_samples': 'a logger that repeats its last value',
     'jumps': 'load pulses',
-    'load_dependent_alpha': 'a relaxation that changes with throttle',
-    'load_dependent_noise': 'sensor noise that follows throttle',
-    'load_dependent_sigma': 'noise that changes with throttle',
+    'load_dependent_alpha': 'a relaxation that changes with $load',
+    'load_dependent_noise': 'sensor noise that follows $load',
+    'load_dependent_sigma': 'noise that changes with $load',
     'load_sag': 'sag',
-    'load_transient': 'a response to changes of throttle',
+    'load_transient': 'a response to changes of $load',
     'lopsided_noise': 'noise with falls deeper than its rises',
     'measurement_noise': 'noise of the sensor',
     'nonlinear_restoring': 'a nonlinear restoring force',
@@ -336,19 +325,21 @@ PLAIN_NAMES = {
 }
 
 
-def by_load(text: str, load: str) -> str:
-    """Replace the word throttle in a text by the name of the load, such as current."""
-    return text if load == 'none' else re.sub(r'\b([Tt])hrottle\b', lambda found: (
-        load.capitalize() if found[1] == 'T' else load), text)
+# Names of causes that depend on changes of the load only, not on the load itself.
+_OF_CHANGES = {
+    'load_dependent_noise': 'sensor noise that follows changes of $load',
+}
 
 
-def plain_name(term: Term) -> str:
-    """Return the plain name of a cause, which says whether throttle or its changes matter."""
-    name, curves = PLAIN_NAMES.get(term.NAME, term.NAME), term.factors()
-    return name if not curves or 'throttle' in curves else name.replace(
-        'throttle', 'changes of throttle')
+def plain_name(term: Term, load: str = 'throttle') -> str:
+    """Return the plain name of a cause, which says whether the load or its changes matter."""
+    curves = term.factors()
+    of_changes = bool(curves) and 'throttle' not in curves
+    name = (_OF_CHANGES if of_changes else PLAIN_NAMES).get(term.NAME) or PLAIN_NAMES.get(
+        term.NAME, term.NAME)
+    return filled(name, load)
 
 
-def both_names(name: str, what: str = '') -> str:
+def both_names(name: str, what: str = '', load: str = 'throttle') -> str:
     """Return a cause's plain name (`what`, else the usual one), and its name in code."""
-    return f'{what or PLAIN_NAMES[name]} ({name})' if name in PLAIN_NAMES else name
+    return f'{what or filled(PLAIN_NAMES[name], load)} ({name})' if name in PLAIN_NAMES else name

@@ -12,14 +12,13 @@ from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Criticism, Finding
 from ou_monitor.discovery.words import (
-    by_load, cause_rows, curve_text, GAIN, gain_text, input_words, parameters,
-    plain_words, with_error)
+    cause_rows, curve_text, GAIN, gain_text, input_words, parameters, plain_words, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import filled, number
 from scipy.signal import welch
 
 # Maximum remaining discrepancies on a terminal.
@@ -122,7 +121,7 @@ def _beside(finding: Finding) -> list[Part]:
     for cause in finding.causes:
         for name, (at, factor) in cause.term.factors().items():
             plot = Plot(f'{cause.name}: factor on the noise',
-                        by_load(input_words(name), finding.load), 'factor', width=450, height=250)
+                        input_words(name, finding.load), 'factor', width=450, height=250)
             small.append(Figure(plot.line(np.array(at), np.array(factor), '', 0, 'thick')))
     return [Text(f'Bands: range of {_DRAWS} simulations. Over load, in bins with similar numbers '
                  'of samples: median of the voltage, and rms of its change to the next sample.',
@@ -155,12 +154,12 @@ def _measures(samples: Samples, voltage: FloatArray) -> list[tuple[FloatArray, F
 def _causes(finding: Finding) -> list[Part]:
     if not finding.causes:
         return [Text('No cause was named.')]
-    found = cause_rows(finding.causes)
+    found = cause_rows(finding.causes, finding.load)
     return [
         Table(['cause', 'what it is', 'family', 'gain, mnat/sample',
                'p (fit or gain)', 'alternatives'],
-              [[row.label, by_load(row.what, finding.load),
-                row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
+              [[row.label, row.what, row.family, row.gain, row.chance,
+                ', '.join(row.alternatives) or '-']
                for row in found], left=[0, 1, 2, 5]),
         Text(GAIN),
         Notes.of([f'{row.label}: {row.explanation}' for row in found]),
@@ -231,10 +230,10 @@ def _statistics(finding: Finding) -> list[Part]:
 
 
 def _scores(finding: Finding, found: Sequence[Criticism]) -> Table:
-    rows = [[by_load(c.statistic, finding.load),
+    rows = [[c.statistic,
              *([number(c.before)] if finding.causes else []), number(c.after),
              f'[{number(c.low)}, {number(c.high)}]',
-             by_load(plain_words(c.statistic), finding.load)]
+             plain_words(c.statistic, finding.load)]
             for c in found]
     return Table(['statistic', *(['plain OU'] if finding.causes else []), 'score',
                   'band', 'in words'], rows, left=[0, len(rows[0]) - 1], most=_SHOWN)
@@ -246,7 +245,7 @@ def _parameters(finding: Finding) -> list[Part]:
     for term, se in zip(finding.model.terms, finding.se):
         curves = term.factors()
         rows += [[term.NAME, f'factor over {name}', curve_text(*curve), '-',
-                  by_load(f'factor on the noise over {input_words(name)}', finding.load)]
+                  f'factor on the noise over {input_words(name, finding.load)}']
                  for name, curve in curves.items()]
         for spec in fields(term):
             value = getattr(term, spec.name)
@@ -257,7 +256,7 @@ def _parameters(finding: Finding) -> list[Part]:
             rows.append([term.NAME, spec.name,
                          with_error(value, se.get(spec.name), positive=term.positive(spec.name)),
                          spec.metadata['unit'] or '-',
-                         by_load(spec.metadata['text'], finding.load)])
+                         filled(spec.metadata['text'], finding.load)])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
              'sigma describe the relaxation and noise not explained by the causes; alpha and '
              'sigma of the plain OU above include the causes.'

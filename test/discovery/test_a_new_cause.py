@@ -94,7 +94,7 @@ def test_it_is_named_measured_and_explained(found):
     assert cause.term.FAMILY == 'events' == hidden.families[0]
     true = hidden.detail['heartbeat']['height_v']
     assert abs(cause.term.height - true) < 4.0 * cause.se['height'] < 2.0 * abs(true)
-    assert 'once a second' in cause.explanation and 'beacon' in cause.explanation
+    assert 'once a second' in cause.explanation.text and 'beacon' in cause.explanation.text
     assert 'heartbeat' in finding.sentence
 
 

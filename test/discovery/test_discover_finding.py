@@ -7,7 +7,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.discover import discover, doubts, judge
-from ou_monitor.discovery.finding import Cause, Criticism, Finding, LowDips, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Explanation, Finding, LowDips, Verdict
 from ou_monitor.discovery.fitting import with_reach
 from ou_monitor.discovery.words import parameters
 from ou_monitor.model.ou import simulate
@@ -27,8 +27,8 @@ FINE = Criticism('skewness', 1.0, 0.5, -3.7, 3.7, 1.0, 1.0)
 def finding(**changes):
     """Return a finding with a sag and two tones."""
     sag, tone = LoadSag(0.5, 0.0), Tone(0.01, 50.0, 0.0, 0.0)
-    cause = Cause(sag, {'linear': 0.02}, 0.015, 0.002, 1e-9, ('load_transient',), 'It sags.',
-                  False)
+    cause = Cause(sag, {'linear': 0.02}, 0.015, 0.002, 1e-9, ('load_transient',),
+                  Explanation('It sags.', ('linear = 0.5 V',), ('Alone.',), 'Mend it.'), False)
     simulated = {
         'recording': 'x', 'n': 10, 'duration': 1.0, 'verdict': Verdict.PARTLY_EXPLAINED,
         'words': ('s',), 'baseline': OU(60.0, 0.3, 5.0), 'baseline_score': 2.0,
@@ -55,7 +55,9 @@ def test_json_has_the_documented_keys():
     (cause,) = data['causes']
     assert {'name': 'load_sag', 'family': 'load', 'gain': 0.015, 'gain_se': 0.002,
             'p_value': 1e-9, 'params': {'linear': 0.5, 'square': 0.0, 'growth': 0.0},
-            'alternatives': ['load_transient'], 'explanation': 'It sags.'}.items() <= cause.items()
+            'alternatives': ['load_transient'],
+            'explanation': 'It sags. Estimate: linear = 0.5 V. Alone. Mend it.'
+            }.items() <= cause.items()
     assert cause['units'] == {'linear': 'V', 'square': 'V', 'growth': 'V/s'}
     assert cause['exact'] is False
     extended = data['extended']

@@ -134,7 +134,7 @@ def test_a_shrinking_sag_is_measured_and_simulated():
     for name, value in made.terms[1].values().items():
         assert abs(getattr(cause.term, name) - value) < 4.0 * cause.se[name] < 0.5
     assert cause.term.growth < -10.0 * cause.se['growth']
-    assert 'growth = -0.010' in cause.explanation and finding.model.terms[1] == cause.term
+    assert 'growth = -0.010' in cause.explanation.text and finding.model.terms[1] == cause.term
 
 
 def test_switching_between_large_levels_is_found():

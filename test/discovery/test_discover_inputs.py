@@ -201,6 +201,6 @@ def test_lines_of_one_kind_are_measured_together(monkeypatch):
     found = discover(Recording(t, v, np.full(t.size, math.nan), 'comb'))
     tones = [cause for cause in found.causes if cause.name == 'tone']
     assert len(tones) >= 4 and len({(c.gain, c.gain_se) for c in tones}) == 1
-    assert all(f'joint gain of all {len(tones)} tone' in c.explanation for c in tones)
+    assert all(f'joint gain of all {len(tones)} tone' in c.explanation.text for c in tones)
     assert len(fits) <= 1 + len(found.causes) - len(tones)
     assert tones[0].gain == pytest.approx(found.gain, rel=0.05)

@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 import re
 
-from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Explanation, Finding, Verdict
 from ou_monitor.discovery.words import (
     both_names, cause_rows, coupling_note, explain, gain_text, input_words, parameters,
     PLAIN_NAMES, plain_words, verdict_words, with_error)
@@ -16,7 +16,8 @@ from ou_monitor.model.terms.tones import Tone
 import pytest
 
 NAN = math.nan
-SAG = Cause(LoadSag(0.5, 0.0), {}, 0.02, 0.003, 1e-3, (), 'It sags.', False)
+SAG = Cause(LoadSag(0.5, 0.0), {}, 0.02, 0.003, 1e-3, (),
+            Explanation('It sags.', ('linear = 0.5 V',), (), ''), False)
 
 
 def left_over(name):
@@ -58,24 +59,22 @@ def test_p_values_are_written_with_one_rule(chance, text):
     assert cause_rows([replace(SAG, p_value=chance, exact=True)])[0].chance == 'exact'
 
 
-def tone_cause(frequency, explanation):
+def tone_cause(frequency):
     """Return a cause with a gain that all lines share."""
-    return Cause(Tone(0.01, frequency, 0.3, 0.0), {}, 0.02, 0.003, 1e-6, (), explanation, False)
+    term = Tone(0.01, frequency, 0.3, 0.0)
+    return Cause(term, {}, 0.02, 0.003, 1e-6, (), explain(term, {}, [], together=2), False)
 
 
 def test_terms_that_share_a_gain_are_one_row_with_the_estimates_of_all():
-    first, other = tone_cause(31.0, ''), tone_cause(67.0, 'The second.')
+    first, other = tone_cause(31.0), tone_cause(67.0)
     (single,) = cause_rows([first])
     estimate, last = (parameters(one.term, one.se) for one in (first, other))
-    assert '31.00 Hz' in estimate
-    first = replace(first, explanation=f'The first. Estimate: {estimate}. Mend it.')
+    assert '31.00 Hz' in estimate and f' Estimate: {estimate}. ' in single.explanation
+    assert single.label == first.name and single.explanation == first.explanation.text
     (row,) = cause_rows([first, other])
     assert row.label == f'{first.name} x2'
-    assert row.explanation == f'The first. Estimates: (1) {estimate}. (2) {last}. Mend it.'
-    # One that holds no estimate has them added.
-    (added,) = cause_rows([replace(first, explanation='Bare.'), other])
-    assert added.explanation == f'Bare. Estimates: (1) {estimate}. (2) {last}.'
-    assert single.label == first.name and cause_rows([other])[0].explanation == 'The second.'
+    assert row.explanation == single.explanation.replace(
+        f'Estimate: {estimate}.', f'Estimates: (1) {estimate}. (2) {last}.')
 
 
 def finding(verdict, causes=(), left=(), **more):
@@ -90,7 +89,7 @@ def finding(verdict, causes=(), left=(), **more):
     (Verdict.PARTLY_EXPLAINED, True, False, 'comes closer, but is not yet right: too slow'),
     (Verdict.PARTLY_EXPLAINED, True, True, 'comes closer, but is not yet right: too slow')))
 def test_each_verdict_has_its_sentence(verdict, named, left, words):
-    found = finding(verdict, [tone_cause(31.0, '')] * named, [left_over('skewness')] * left)
+    found = finding(verdict, [tone_cause(31.0)] * named, [left_over('skewness')] * left)
     text = ' '.join(verdict_words(found, doubts=['too slow'] if 'slow' in words else []))
     assert words in text and ('mnat' in text) == named
     assert ('A plain simulation lacks a spectral line' in text) == named
@@ -120,7 +119,7 @@ def test_the_verdict_comes_before_the_gain():
 @pytest.mark.parametrize('error, inrush', [(0.2, True), (1.1, False)])
 def test_an_answer_whose_sign_is_not_known_is_not_said_to_be_inrush(error, inrush):
     term = LoadTransient(2.0, 0.009, 0.0, -3.6)
-    text = explain(term, {'gain': error, 'rise': 2.0 * error}, [])
+    text = explain(term, {'gain': error, 'rise': 2.0 * error}, []).text
     assert ('inrush of motors' in text.replace('lag, inrush', '')) == inrush
 
 
@@ -140,7 +139,7 @@ def test_every_cause_has_its_words(name):
     values.update({'number': [0.0]} if 'number' in values else {})
     values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
     term = kind.read(values)
-    text = explain(term, {}, ['drift'])
+    text = explain(term, {}, ['drift']).text
     assert len(text) > 120 and 'To separate them' in text and '(for drift)' in text
     told = [p for p in kind.parameters() if not (term.factors() and isinstance(values[p], list))]
     assert all(f'{kind.label(p)} = ' in text for p in told)
@@ -150,12 +149,14 @@ def test_every_cause_has_its_words(name):
 @pytest.mark.parametrize('index, what, when', [
     (0.0, 'follows throttle', 'at high throttle'),
     (4.0, 'follows changes of throttle', 'soon after changes of throttle')])
-def test_noise_says_which_input_it_follows(index, what, when):
+@pytest.mark.parametrize('load', ['throttle', 'current'])
+def test_noise_says_which_input_it_follows(index, what, when, load):
+    what, when = what.replace('throttle', load), when.replace('throttle', load)
     law = replace(SAG, term=LoadDependentNoise((index, index), (0.1, 0.2), (0.0, 1.0)))
     assert f'sensor noise that {what} (load_dependent_noise)' in verdict_words(
-        finding(Verdict.EXPLAINED, [law]))[0]
-    assert cause_rows([law])[0].what == f'sensor noise that {what}'
-    assert f'Give readings {when} less weight' in explain(law.term, {}, [])
+        finding(Verdict.EXPLAINED, [law], full=10.0 if load == 'current' else NAN))[0]
+    assert cause_rows([law], load)[0].what == f'sensor noise that {what}'
+    assert f'Give readings {when} less weight' in explain(law.term, {}, [], load=load).remedy
 
 
 def test_the_verdict_says_what_is_left_or_refused():

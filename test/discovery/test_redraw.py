@@ -84,7 +84,7 @@ def test_a_rail_at_the_bottom_gives_no_cause_that_is_not_there():
     assert {cause.name for cause in found.causes} == {
         'saturation', 'load_sag', 'load_dependent_sigma', 'measurement_noise'}
     # The end that no reading met is not told as if it were known, nor saved as a voltage.
-    (said,) = [cause.explanation for cause in found.causes if cause.name == 'saturation']
+    (said,) = [cause.explanation.text for cause in found.causes if cause.name == 'saturation']
     assert 'low = ' in said and 'high = ' not in said
     # Errors of one step, and how well their size is known, are the two parts of the gain.
     extended = found.as_data()['extended']

@@ -20,9 +20,9 @@ from scipy.signal import correlate
 # requirement, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
 _GROWS = 6.0
 # Meaning and remedy of a sag.
-_FALLS = ('The mean falls with throttle: IR drop of battery, leads and regulator. The estimates '
+_FALLS = ('The mean falls with $load: IR drop of battery, leads and regulator. The estimates '
           'are settled values; sag and resistance of the supply refer to 1 s after a step.')
-_LESS = ('Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
+_LESS = ('Give the estimator the $load, so that it removes the sag; thicker or shorter leads '
          'reduce it.')
 
 
@@ -49,14 +49,14 @@ class LoadSag(Term):
     LIVE = True
     MEANING = by_parameters(
         _FALLS, lambda term: _FALLS if term.falls() else
-        'The mean rises with throttle, as if throttle were inverted or not the load.')
+        'The mean rises with $load, as if $load were inverted or not the load.')
     REMEDY = by_parameters(_LESS, lambda term: _LESS if term.falls() else
-                           'Check topic, unit and sign of throttle.')
-    SEPARATED_BY = 'throttle held for some seconds at several levels'
+                           'Check topic, unit and sign of $load.')
+    SEPARATED_BY = '$load held for some seconds at several levels'
 
-    linear: float = parameter('V', 'drop at full throttle, linear part',
+    linear: float = parameter('V', 'drop at full $load, linear part',
                               label='settled fall, linear')
-    square: float = parameter('V', 'drop at full throttle, quadratic part',
+    square: float = parameter('V', 'drop at full $load, quadratic part',
                               label='settled fall, square')
     growth: float = parameter('V/s', 'growth of the linear part', default=0.0)
 
@@ -116,22 +116,22 @@ class LoadTransient(Term):
     SEVERAL = True
     RECURS = True
     MEANING = by_parameters(
-        'The mean responds to changes of throttle: lag, inrush or slow recovery of polarisation.',
+        'The mean responds to changes of $load: lag, inrush or slow recovery of polarisation.',
         lambda term: term.about()[0])
     REMEDY = by_parameters(
-        'Include the fall after a throttle step in the brown-out margin.',
+        'Include the fall after a $load step in the brown-out margin.',
         lambda term: term.about()[1])
     SEPARATED_BY = (
-        'single steps of throttle, each held for ten times the time constant of the response')
+        'single steps of $load, each held for ten times the time constant of the response')
 
-    gain: float = parameter('V', 'part of a step to full throttle that decays with tau',
+    gain: float = parameter('V', 'part of a step to full $load that decays with tau',
                             label='decaying part')
     tau: float = parameter('s', 'time constant of the decay', 0.0, above=True)
     delay: float = parameter('s', 'delay before the response begins', 0.0)
-    rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
-    square: float = parameter('V', 'decaying part that follows the square of throttle',
+    rise: float = parameter('V', 'added to the gain while $load rises', default=0.0)
+    square: float = parameter('V', 'decaying part that follows the square of $load',
                               label='decaying part, square', default=0.0)
-    lagged: float = parameter('V', 'decaying part that follows the square of the lagging throttle',
+    lagged: float = parameter('V', 'decaying part that follows the square of the lagging $load',
                               label='decaying part, square of the lag', default=0.0)
 
     def about(self) -> tuple[str, str]:
@@ -217,15 +217,15 @@ _INRUSH = 0.2
 # Meaning and remedy; keys: whether the response is slower than the motors, and whether it delays
 # the fall rather than deepening it.
 _ABOUT = {
-    (False, True): ('Part of the fall lags behind throttle: motors and filters respond late.',
-                    'Expect a smaller fall in short bursts of throttle.'),
-    (False, False): ('The voltage falls deepest just after throttle rises: inrush of motors.',
+    (False, True): ('Part of the fall lags behind $load: motors and filters respond late.',
+                    'Expect a smaller fall in short bursts of $load.'),
+    (False, False): ('The voltage falls deepest just after $load rises: inrush of motors.',
                      'Include this fall in the brown-out margin; capacitance at the ESC reduces '
                      'it.'),
-    (True, True): ('Part of the fall follows throttle slowly, and recovers as slowly: '
+    (True, True): ('Part of the fall follows $load slowly, and recovers as slowly: '
                    'polarisation of a battery, or a slow regulator.',
-                   'Set the brown-out margin for the longest burst of throttle.'),
-    (True, False): ('Part of the fall after a rise of throttle recovers while throttle is held: a '
+                   'Set the brown-out margin for the longest burst of $load.'),
+    (True, False): ('Part of the fall after a rise of $load recovers while $load is held: a '
                     'regulator corrects it, or a battery warms.',
                     LoadTransient.REMEDY)}
 # Number of delays to try, and maximum delay, s.
@@ -260,10 +260,10 @@ class LoadDependentSigma(Term):
     SEARCH = by_parameters(
         0.0, lambda term: _STEP_COST if term.steps() else 0.0)
     LIVE = True
-    MEANING = 'The noise grows or shrinks with throttle.'
+    MEANING = 'The noise grows or shrinks with $load.'
     REMEDY = (
         'Run the estimator in flight, so that filter and risk use the noise at the present load.')
-    SEPARATED_BY = 'throttle held for some seconds at several levels'
+    SEPARATED_BY = '$load held for some seconds at several levels'
 
     throttle: tuple[float, ...] = parameters('', 'knots, rising')
     log_factor: tuple[float, ...] = parameters('', 'ln(sigma at the knot / sigma of the ou)')
@@ -421,13 +421,16 @@ class LoadDependentAlpha(Term):
     SIGNS = ('state throttle',)
     MEASURED = True
     LIVE = True
-    MEANING = 'The relaxation rate depends on throttle.'
+    MEANING = by_parameters(
+        'The relaxation rate depends on $load.', lambda term:
+        'The relaxation rate and the noise depend on $load.' if term.sigma_slope else
+        type(term).MEANING)
     REMEDY = (
-        'Fit each throttle level separately (analyze): a single alpha is right at one level only.')
-    SEPARATED_BY = 'throttle held for 50 relaxation times at each of several levels'
+        'Fit each $load level separately (analyze): a single alpha is right at one level only.')
+    SEPARATED_BY = '$load held for 50 relaxation times at each of several levels'
 
-    slope: float = parameter('', 'ln of the factor of alpha at full throttle')
-    sigma_slope: float = parameter('', 'ln of the factor of sigma at full throttle', default=0.0)
+    slope: float = parameter('', 'ln of the factor of alpha at full $load')
+    sigma_slope: float = parameter('', 'ln of the factor of sigma at full $load', default=0.0)
 
     def change(self, s: Segment) -> None:
         s.alpha *= np.exp(self.slope * s.throttle)
@@ -494,6 +497,11 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
     return knots, np.clip(factors - factors[0], -_MOST, _MOST)
 
 
+# Remedy of white noise that depends on the load.
+_FASTER = ('Sample faster to tell ripple from a fast rail; against ripple, add capacitance at the '
+           'ESCs or a filter before the ADC.')
+
+
 @dataclass(frozen=True)
 class LoadDependentNoise(Term):
     """
@@ -517,13 +525,12 @@ class LoadDependentNoise(Term):
     APART = by_parameters(0, lambda term: max(0, len(term.at) - len(set(term.number)) - 1))
     CHANGES = MeasurementNoise
     MEANING = (
-        'The white noise of the readings depends on throttle or its changes: ripple of the ESCs, '
+        'The white noise of the readings depends on $load or its changes: ripple of the ESCs, '
         'or a rail that relaxes faster than the sampling, which looks the same.')
     REMEDY: ClassVar[str] = by_parameters(
-        'Sample faster to tell ripple from a fast rail; against ripple, add capacitance at the '
-        'ESCs or a filter before the ADC. Give readings at high throttle less weight.',
+        f'{_FASTER} Give readings at high $load less weight.',
         lambda term: LoadDependentNoise.REMEDY if 0 in term.number else
-        LoadDependentNoise.REMEDY.replace('at high throttle', 'soon after changes of throttle'))
+        f'{_FASTER} Give readings soon after changes of $load less weight.')
     SEPARATED_BY = (
         'the same flight at several times the sampling rate: white noise stays uncorrelated')
 

@@ -88,7 +88,7 @@ class LopsidedNoise(Term):
     MAY_LEAVE = 0.3
     MEANING = (
         'The white noise is asymmetric, with dips rarer and deeper than rises or the reverse: '
-        'load pulses that are shorter than the time between readings and not visible in throttle.')
+        'load pulses that are shorter than the time between readings and not visible in $load.')
     REMEDY = (
         'Take the margin from the quantile of the dips, not from the rms; capacitance at the ESCs '
         'makes short dips shallower.')

@@ -277,7 +277,7 @@ class RegimeSwitching(Term):
         'flicker_noise', 'heavy_tails', 'jumps', 'nonlinear_restoring', 'second_relaxation',
         'volatility')
     SEVERAL = True
-    MEANING = 'The supply switches between states, independent of throttle.'
+    MEANING = 'The supply switches between states, independent of $load.'
     REMEDY = 'Look for a load that switches on and off, or a loose contact.'
     SEPARATED_BY = 'a recording with the state of the other loads'
 

@@ -517,7 +517,7 @@ class Volatility(Term):
     SLOW_FIT = True
     SIGNS = ('clustering', 'kurtosis')
     IMITATES = ('heavy_tails', 'jumps', 'regime_switching')
-    MEANING = 'sigma changes slowly at random, independent of throttle.'
+    MEANING = 'sigma changes slowly at random, independent of $load.'
     REMEDY = 'Judge the noise by the last seconds, not by the mean of a flight.'
     SEPARATED_BY = 'a recording several times as long that includes the temperature'
 

@@ -37,8 +37,8 @@ class Drift(Term):
     LEAST_SHARE = 0.02
     MEANING: ClassVar[str] = by_parameters(
         'The mean moves slowly (a fall is negative): discharge or warming.',
-        lambda term: Drift.MEANING.replace(
-            'slowly', 'slowly, by rate without load plus charge at full load')
+        lambda term: ('The mean moves slowly, by rate without load plus charge at full load (a '
+                      'fall is negative): discharge or warming.')
         if term.charge else Drift.MEANING)
     REMEDY = 'Use a window in which the drift is small, or remove the trend first.'
     SEPARATED_BY = 'a recording several times as long'
@@ -95,7 +95,7 @@ class SecondRelaxation(Term):
     MEANING = (
         'A second relaxation, with its own rate, adds to the first: a second storage element.')
     REMEDY = 'Keep both relaxations in the model: a single alpha describes neither.'
-    SEPARATED_BY = 'a recording ten times as long, throttle held still'
+    SEPARATED_BY = 'a recording ten times as long, $load held still'
 
     alpha: float = parameter('1/s', 'its relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'its noise intensity', 0.0)

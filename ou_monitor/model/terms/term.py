@@ -331,6 +331,7 @@ class Term:
     # Whether the live estimate, which is for the present throttle, includes the effect.
     LIVE: ClassVar[bool] = False
     # Texts for the report: meaning, remedy, and a recording that separates it from other causes.
+    # `$load` in them, and in the texts of parameters, stands for throttle or the measured current.
     MEANING: ClassVar[str] = ''
     REMEDY: ClassVar[str] = ''
     SEPARATED_BY: ClassVar[str] = ''

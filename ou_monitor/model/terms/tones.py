@@ -154,7 +154,7 @@ class Resonance(Term):
     REFUTED_BY = ('bursts', 'products of three')
     MEANING = 'The rail rings: inductance of the leads against the capacitors.'
     REMEDY = 'Damp it with a resistive (electrolytic) capacitor or shorter leads.'
-    SEPARATED_BY = 'constant throttle, sampled at ten times that frequency'
+    SEPARATED_BY = 'constant $load, sampled at ten times that frequency'
 
     frequency: float = parameter('Hz', 'frequency of the ringing', 0.0, above=True)
     damping: float = parameter('1/s', 'decay rate of the ringing', 0.0, above=True)
@@ -242,15 +242,15 @@ class ThrottleTone(Term):
     SEVERAL = True
     RECURS = True
     MAY_LEAVE = 0.3
-    MEANING = 'A spectral line that follows throttle: commutation of the motors.'
-    REMEDY = 'Add capacitance at the ESC, or a notch that follows throttle.'
-    SEPARATED_BY = 'a slow sweep of throttle'
+    MEANING = 'A spectral line that follows $load: commutation of the motors.'
+    REMEDY = 'Add capacitance at the ESC, or a notch that follows $load.'
+    SEPARATED_BY = 'a slow sweep of $load'
 
     amplitude: float = parameter('V', 'peak', 0.0)
-    idle: float = parameter('Hz', 'frequency at zero throttle; below 0 for an alias')
-    slope: float = parameter('Hz', 'frequency at full throttle less idle')
+    idle: float = parameter('Hz', 'frequency at zero $load; below 0 for an alias')
+    slope: float = parameter('Hz', 'frequency at full $load less idle')
     phase: float = parameter('rad', 'phase at the first sample')
-    linewidth: float = parameter('Hz', 'width of the line; 0: it follows throttle exactly', 0.0)
+    linewidth: float = parameter('Hz', 'width of the line; 0: it follows $load exactly', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         turns = 0.0
