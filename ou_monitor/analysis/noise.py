@@ -137,9 +137,8 @@ def without_wild(recording: Recording, left: Remainder) -> tuple[Recording, Rema
         return recording, left
     bad = np.zeros(recording.n, dtype=np.bool_)
     bad[wild] = True
-    recording = part_of(recording, ~bad, *(
-        note.replace('left out', 'left out, except from lowest voltage and dips')
-        for note in bad_notes(recording.t, recording.voltage, bad)))
+    recording = part_of(recording, ~bad, *bad_notes(
+        recording.t, recording.voltage, bad, 'left out, except from lowest voltage and dips'))
     return recording, remainder(recording)
 
 

@@ -98,6 +98,11 @@ class ComparedNumber:
         return np.asarray((values < low - hair) | (values > self.high + hair))
 
     @property
+    def label(self) -> str:
+        """Return the name with the unit of the data."""
+        return f'{self.name}, {self.unit}' if self.unit else self.name
+
+    @property
     def texts(self) -> list[str]:
         """Return the unit, the measured number, and low, median and high of the simulations."""
         # Levels in V, differences in mV.
@@ -109,8 +114,9 @@ class ComparedNumber:
     def words(self) -> str:
         """Return the number as a part of a sentence."""
         unit, measured, low, median, high = self.texts
-        return (f'{self.name}, simulated {median} {unit} ({low} to {high}), measured {measured} '
-                f'{unit}').replace('  ', ' ').rstrip()
+        unit = f' {unit}' if unit else ''
+        return (f'{self.name}, simulated {median}{unit} ({low} to {high}), measured '
+                f'{measured}{unit}')
 
     def as_data(self) -> dict[str, float]:
         """Return the four numbers by name."""
@@ -209,7 +215,7 @@ class Agreement:
 
     def measures(self) -> list[dict[str, Any]]:
         """Return all numbers of the recording and of the simulations, in SI units."""
-        return [{'measure': f'{row.name}, {row.unit}'.removesuffix(', '), **row.as_data(),
+        return [{'measure': row.label, **row.as_data(),
                  'inside': row.inside} for row in self.rows]
 
     def as_data(self) -> dict[str, Any]:

@@ -266,20 +266,21 @@ def _quantiles(v: FloatArray, *shares: float) -> list[float]:
     return found
 
 
-def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
-    """Return notes on bad samples (t in s, v in V)."""
+def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_],
+              left_out: str = 'left out') -> list[str]:
+    """Return notes on bad samples (t in s, v in V; left_out: what was done with them)."""
     low, high = float(v[~bad].min()), float(v[~bad].max())
     rest = f'while all others lie within {_short(low)} to {_short(high)} V'
     values, count = np.unique(v[bad], return_counts=True)
     notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as an error code, or '
-             'as the supply being off, and left out.'
+             f'as the supply being off, and {left_out}.'
              for value, many in zip(values.tolist(), count.tolist()) if many >= _CODE]
     single = np.flatnonzero(bad & np.isin(v, values[count < _CODE]))
     if single.size:
         where = ', '.join(f'{_short(float(v[k]))} V at {number(float(t[k] - t[0]), 4)} s'
                           for k in single[:_SINGLES])
         more = '' if single.size <= _SINGLES else f' and {single.size - _SINGLES} more'
-        notes.append(f'{counted(single.size, "bad sample")} left out: {where}{more}, {rest}. '
+        notes.append(f'{counted(single.size, "bad sample")} {left_out}: {where}{more}, {rest}. '
                      'Glitches of the sensor or the bus, and short dips, look like this.')
     return notes
 

@@ -54,7 +54,7 @@ def discover(recording: Recording, *, seed: int = 0,
     while True:
         try:
             found = _discover(recording, seed, progress)
-            return replace(found, notes=(*found.notes, *left_out()))
+            return replace(found, notes=(*found.notes, *left_out().values()))
         except Exception as error:
             # A cause from another package may fail anywhere: repeat without it, and note that.
             if not withdraw(error):

@@ -73,9 +73,10 @@ def parameters(term: Term, se: Mapping[str, Any], load: str = 'throttle') -> str
     found = []
     for name, value in known.items():
         if name not in long:
-            shown = with_error(value, se.get(name), positive=term.positive(name))
-            found.append(f'{term.label(name)} {shown}' if shown == VAGUE_NUMBER else
-                         f'{term.label(name)} = {shown} {term.unit(name)}'.rstrip())
+            error, positive = se.get(name), term.positive(name)
+            found.append(f'{term.label(name)} {VAGUE_NUMBER}' if positive and is_vague(
+                value, error) else f'{term.label(name)} = ' + ' '.join(filter(None, (
+                    with_error(value, error, positive=positive), term.unit(name)))))
     found += [f'factor over {input_words(name, load)} = {curve_text(*curve)}'
               for name, curve in curves.items()]
     return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '

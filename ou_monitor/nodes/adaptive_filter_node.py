@@ -366,7 +366,8 @@ class AdaptiveFilterNode(MonitorNode):
         if self._stamper.waiting and self._unplaced:
             return Level.WARN, NO_CLOCK
         if self._input_clock.stamps is not StampOrder.GOOD:
-            return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
+            return Level.WARN, f'{self._topic}: ' + self._input_clock.stamps.sentence(
+                'their arrival times are used')
         if math.isnan(supply.sigma):
             return Level.WARN, (
                 f'The cutoff goes to the fallback, {s.fallback:g} Hz, because '

@@ -88,21 +88,18 @@ class SourceInterval:
 
 
 class StampOrder(enum.Enum):
-    """Quality of the stamps; the value is the sentence for the pilot."""
+    """Quality of the stamps; the value is the defect and the remedy, in words."""
 
-    GOOD = 'The stamps increase.'
-    FROZEN = (
-        'Samples arrive, but their stamps do not advance: they allow no estimate; the '
-        'driver must set header.stamp for every message.')
-    IRREGULAR = (
-        'The stamps of the samples go back and forth: they allow no estimate; look for '
-        'a second source of the topic, or a driver with two clocks.')
+    GOOD = 'The stamps increase', ''
+    FROZEN = ('Samples arrive, but their stamps do not advance',
+              'the driver must set header.stamp for every message')
+    IRREGULAR = ('The stamps of the samples go back and forth',
+                 'look for a second source of the topic, or a driver with two clocks')
 
-    @property
-    def by_arrival(self) -> str:
-        """Return the sentence for samples whose times are their arrival times."""
-        found, _, advice = self.value.partition(': they allow no estimate')
-        return f'{found}: their arrival times are used{advice}'
+    def sentence(self, effect: str) -> str:
+        """Return a sentence for the pilot, with the effect of the defect."""
+        defect, remedy = self.value
+        return f'{defect}: {effect}; {remedy}.'
 
 
 class StampWatch:
@@ -359,7 +356,7 @@ class InputTrust:
         if self.outside:
             return Doubt.OTHER, self.outside
         if stamps is not StampOrder.GOOD:
-            return Doubt.STAMPS, stamps.value
+            return Doubt.STAMPS, stamps.sentence('they allow no estimate')
         if limit <= 0.0:
             return Doubt.LIMIT, (
                 f'brownout.voltage is {limit:g} V: no voltage is below it, and the floor is off; '

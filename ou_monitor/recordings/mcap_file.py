@@ -145,6 +145,7 @@ class McapFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._unpacked = self._metadata = 0
+        self._metadata_read = True  # Whether all of it could be read
         # Whether the summary counts the messages and lists the chunks, which are read later.
         self._trusted = False
         # One for all chunks, because creating it takes as long as unpacking a small chunk.
@@ -158,7 +159,7 @@ class McapFile:
             head = file.read(64)
             if not head.startswith(MAGIC):
                 raise InputError(f'{self.path} is not an MCAP file: '
-                                 f'{kind_of_foreign(head, self.path)}')
+                                 f'{kind_of_foreign(head, self.path)[1]}')
             self._summary = self._read_summary(file)
             self._walk(file, self._use_summary(partial))
         self.origin_ns = self.start_ns
@@ -342,9 +343,10 @@ class McapFile:
                 raise Damage(f'metadata records exceed {2 * _MOST_METADATA} bytes')
             record = _parse(Metadata, self._content(file, length, _MOST_METADATA))
         except Damage as error:
-            if not any(note.startswith('Metadata') for note in self.notes):
+            if self._metadata_read:
                 self.notes.append(f'Metadata of {printable(self.path.name)} cannot be read '
                                   f'({error}).')
+            self._metadata_read = False
             return
         if record.name == ABOUT:
             self.about |= plain_texts(record.metadata)

@@ -103,7 +103,7 @@ def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
     name = str(entry['term'])
     terms = catalogue()
     if name not in terms:
-        why = next((one for one in left_out() if f"'{name}'" in one), nearest(name, terms))
+        why = left_out().get(name) or nearest(name, terms)
         raise InputError(f"{where}: unknown term '{name}': {why}")
     for key in entry:
         if key not in _TERM_KEYS:

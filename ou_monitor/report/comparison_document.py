@@ -66,7 +66,7 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
     out = []
     for row in found.rows:
         unit, measured, low, median, high = row.texts
-        out.append((f'{row.name}, {unit}'.removesuffix(', '), measured,
+        out.append((f'{row.name}, {unit}' if unit else row.name, measured,
                     f'{median}\n[{low}, {high}]', '' if row.inside else 'outside'))
     return out
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 import math
-import re
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from ou_monitor.records import FloatArray, NAN, Severity
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, counted, number, p_words, some, volts, Z95
+from ou_monitor.text import chance, counted, listed, number, p_words, some, volts, Z95
 
 _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
            'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1'}
@@ -119,9 +118,9 @@ def _ageing(fleet: Fleet) -> str:
 
 def _flights_of_pack(fleet: Fleet, trends: Sequence[Trend]) -> str:
     mine = fleet.recordings_of(trends[0].vehicle)
-    dates, cells = _dates(mine), _cells_of(mine)
-    words = [counted(max(t.flights for t in trends), 'flight'), '' if dates == UNKNOWN else dates,
-             f'{cells[:-1]} cells, a guess' if cells.endswith('?') else '']
+    guessed = sorted({row['cells'] for row in mine if _guessed(row)})
+    words = [counted(max(t.flights for t in trends), 'flight'), _dates(mine),
+             f'{listed(list(map(str, guessed)))} cells, a guess' if guessed else '']
     return f' ({"; ".join(word for word in words if word)})'
 
 
@@ -232,15 +231,9 @@ def _as_compared(judged: Judgement, name: str, vehicle: str, value: float) -> st
 
 
 def failure_words(fleet: Fleet) -> list[str]:
-    """Return each failed recording with the reason, its path named once."""
-    found = []
-    for row in fleet.failed:
-        error = str(row['error']).removeprefix(row['path'])
-        # The error may continue with a line of the file, or with a file in the folder.
-        if not re.match(r':\d+:|/', error):
-            error = f": {error.lstrip(': ')}"
-        found.append(_prefix(row) + row['path'] + error)
-    return found
+    """Return each failed recording with the reason, which may begin with its path."""
+    return [_prefix(row) + (row['error'] if row['error'].startswith(row['path']) else
+                            f"{row['path']}: {row['error']}") for row in fleet.failed]
 
 
 def _prefix(row: Row) -> str:
@@ -265,19 +258,18 @@ def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
 
 def _cells_of(rows: Sequence[Row]) -> str:
     """Return the cells of a vehicle, with a question mark if they are a guess."""
-    return ', '.join(sorted({_cells(row) for row in rows if row['cells']},
-                            key=lambda cells: (int(cells.rstrip('?')), cells))) or UNKNOWN
+    return ', '.join(f'{cells}{"?" * guess}' for cells, guess in sorted({
+        (row['cells'], _guessed(row)) for row in rows if row['cells']})) or UNKNOWN
 
 
-def _cells(row: Row) -> str:
-    return UNKNOWN if not row['cells'] else (
-        f"{row['cells']}{'?' * (row['cells_from'] == 'guessed')}")
+def _guessed(row: Row) -> bool:
+    return bool(row['cells']) and row['cells_from'] == 'guessed'
 
 
 def _dates(rows: Sequence[Row]) -> str:
     found = [row['start'] for row in rows if row['start']]
     days = sorted({f'{date:%Y-%m-%d}' for date in (min(found), max(found))}) if found else []
-    return ' to '.join(days) or UNKNOWN
+    return ' to '.join(days)
 
 
 def _at_throttle(values: Values) -> str:
@@ -346,7 +338,8 @@ def pack_table(fleet: Fleet) -> Table:
     for vehicle in fleet.vehicles:
         mine = fleet.recordings_of(vehicle)
         if any(row[name] is not None for row in mine for name in OF_PACK):
-            rows.append([short[vehicle], _flights(mine), _dates(mine), _cells_of(mine)])
+            rows.append([short[vehicle], _flights(mine), _dates(mine) or UNKNOWN,
+                         _cells_of(mine)])
             for name in OF_PACK:
                 rows[-1] += [_pack_value(mine, name, _star(judged, name, vehicle)),
                              _slope(judged, name, vehicle, interval=True)]
@@ -511,7 +504,7 @@ def _lowest_of(rows: Sequence[Row]) -> str:
     low = rows[0]
     found = f'{number(low["lowest"], 4)} V'
     if low['cells'] and len({row['cells'] for row in rows}) > 1:
-        found = f'{number(_of_a_cell(low), 4)} V per cell ({found}, {_cells(low)} cells)'
+        found = f'{number(_of_a_cell(low), 4)} V per cell ({found}, {_cells_of([low])} cells)'
     u = low['lowest_throttle']
     return f'{found} at {number(low["lowest_at"])} s of {_name(low)}' + (
         '' if u is None else f', at {100.0 * u:.0f} % throttle')
@@ -627,7 +620,7 @@ def _recordings(fleet: Fleet) -> list[Part]:
         start = f"{row['start']:%Y-%m-%d %H:%M UTC}" if row['start'] else ''
         rows.append([
             names.get(row['vehicle'], UNKNOWN), str(row['flight'] or UNKNOWN),
-            f"{row['recording']}\n{start}", _cells(row), _cell(row['duration_s'] or None),
+            f"{row['recording']}\n{start}", _cells_of([row]), _cell(row['duration_s'] or None),
             _cell(row['lowest'], 4), UNKNOWN if row['dips'] is None else f"{row['dips']:g}",
             *measured, ', '.join(sorted(flags[row['path']])) or UNKNOWN])
     heads = ['vehicle', 'flight', 'recording', 'cells', 's', 'lowest, V', 'dips', *[

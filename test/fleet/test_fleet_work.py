@@ -128,7 +128,7 @@ def test_a_failure_names_its_path_once():
         {'path': p, 'error': e, 'vehicle': 'v' if p == '/f/c' else None}
         for p, e in errors.items()])
     assert failure_words(fleet) == ['/f/a.csv:1: no column', '/f/bag/bag_0.mcap is damaged',
-                                    '/f/b.mcap: is empty', 'v: /f/c: something else']
+                                    '/f/b.mcap is empty', 'v: /f/c: something else']
 
 
 def test_work_never_raises(tmp_path, monkeypatch):

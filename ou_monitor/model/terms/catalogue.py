@@ -58,10 +58,10 @@ def every_kind() -> list[type[Term]]:
     return [form for kind in catalogue().values() for form in (kind, *kind.variants())]
 
 
-def left_out() -> tuple[str, ...]:
-    """Return a sentence for each cause of another package that cannot be used."""
+def left_out() -> Mapping[str, str]:
+    """Return a sentence for each cause of another package that cannot be used, by its name."""
     catalogue()
-    return tuple(_left_out.values())
+    return _left_out
 
 
 def blamed(error: BaseException) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import re
 
 import numpy as np
-from ou_monitor.errors import InputError, nearest
+from ou_monitor.errors import closest, InputError, nearest
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, IMU, Log, Series, SPEEDS, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note, prefixed, Recording
@@ -229,9 +229,9 @@ def signal_of(path: Path, log: Log, name: str) -> tuple[Series, tuple[str, ...]]
     found = next((one for one in log.scalars if one.name == name), None)
     if found is None:
         known = list(dict.fromkeys([*log.names, *(one.name for one in log.scalars)]))
-        hint = nearest(name, known) if known else 'it holds none'
-        raise InputError(f"{path} has no series '{name}': "
-                         + (_LIST if hint.startswith('valid:') else hint))
+        hint = 'it holds none' if not known else (
+            nearest(name, known) if closest(name, known) else _LIST)
+        raise InputError(f"{path} has no series '{name}': {hint}")
     series, said = clean(found)
     if not series.n:
         raise InputError(f'{path}: {name} has no usable sample'

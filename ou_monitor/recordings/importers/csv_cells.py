@@ -179,13 +179,25 @@ def _days(year: int, month: int, day: int) -> int:
     return date(year + (2000 if year < 100 else 0), month, day).toordinal() - 719163
 
 
-def clock_times(path: Path, cells: list[str], name: str, left_out: list[str] | None) -> FloatArray:
+class BadLine(NamedTuple):
+    """A line of a CSV that cannot be read."""
+
+    line: int | None  # None: unknown
+    why: str
+
+    def error(self, path: Path) -> str:
+        """Return the error message."""
+        return f'{path}: {self.why}' if self.line is None else f'{path}:{self.line}: {self.why}'
+
+
+def clock_times(path: Path, cells: list[str], name: str,
+                left_out: list[BadLine] | None) -> FloatArray:
     """Return dates and times in s since 1970; without a date since the first midnight."""
     found = [None if not cell.strip() else _CLOCK.fullmatch(cell) for cell in map(_swapped, cells)]
-    bad = [f"{path}: column '{name}' holds '{shown(cells[k])}', not a date or a time"
+    bad = [BadLine(None, f"column '{name}' holds '{shown(cells[k])}', not a date or a time")
            for k, one in enumerate(found) if one is None and cells[k].strip()]
     if bad and left_out is None:
-        raise InputError(bad[0])
+        raise InputError(bad[0].error(path))
     if left_out is not None:
         left_out += bad
     try:

@@ -29,9 +29,9 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.csv_cells import (
-    AMPERE_WORDS, is_clock, is_missing, is_number, is_value, number_of, OTHER_WORDS, SCALES, shown,
-    TIME_WORDS, unit_of, unit_word, VOLT_WORDS, WORDS)
-from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign, TEXT
+    AMPERE_WORDS, BadLine, is_clock, is_missing, is_number, is_value, number_of, OTHER_WORDS,
+    SCALES, shown, TIME_WORDS, unit_of, unit_word, VOLT_WORDS, WORDS)
+from ou_monitor.recordings.importers.formats import Foreign, is_text, kind_of_foreign
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import opened
@@ -160,17 +160,17 @@ def _encoding(path: Path, head: bytes) -> str:
             return name
     if head[1:2] == b'\0' != head[:1] and head[3:4] == b'\0':
         return 'utf-16-le'
-    kind = kind_of_foreign(head, path)
+    kind, words = kind_of_foreign(head, path)
     # A logger that lost power leaves NUL bytes at the end; `numbers` names their line.
     nul = b'\0' in head and not (b'\n' in head and is_text(head.rstrip(b'\0')))
     damage = _DAMAGE.search(head)
-    if nul and damage and kind.startswith('its') and is_text(head[:damage.start()][:8]) and (
+    if nul and damage and kind is Foreign.UNKNOWN and is_text(head[:damage.start()][:8]) and (
             damage.start() >= 8):
         line = head.count(b'\n', 0, damage.start()) + 1
         raise InputError(f'{path}:{line}: the byte 0x{damage[0].hex()} is not text: the file is '
                          'damaged from there on')
-    if nul or kind.startswith('it is') and kind != TEXT:
-        raise InputError(f'{path} is not a table: {kind}')
+    if nul or kind is Foreign.NAMED:
+        raise InputError(f'{path} is not a table: {words}')
     # A Chinese character takes two bytes; the µ and ° of an older Windows program take one.  Some
     # bytes of Japanese names do not exist in cp1252; Latin-1 has all bytes.
     runs = [len(run) for run in re.findall(rb'[\x80-\xff]+', head)]
@@ -478,9 +478,9 @@ def holds_clocks(form: Form, place: int) -> bool:
 
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None,
-            left_out: list[str] | None = None) -> list[FloatArray]:
+            left_out: list[BadLine] | None = None) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
-    # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
+    # A bad line raises InputError, or with `left_out` is dropped and appended there.
     parts: list[list[FloatArray]] = [[] for _ in places]
     with_unit = [place for place in places if has_unit_beside(form.names, place)]
     last = max([*places, *(texts or {}), *(place + 1 for place in with_unit)])
@@ -586,7 +586,7 @@ def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
 
 
 def _fitting(path: Path, lines: Sequence[int], rows: list[list[str]], width: int, last: int,
-             form: Form, left_out: list[str] | None) -> tuple[Sequence[int], list[list[str]]]:
+             form: Form, left_out: list[BadLine] | None) -> tuple[Sequence[int], list[list[str]]]:
     """Return the rows that are not blank, all of one width, and their lines."""
     kept: list[int] = []
     for k, row in enumerate(rows):
@@ -597,19 +597,19 @@ def _fitting(path: Path, lines: Sequence[int], rows: list[list[str]], width: int
         elif not blank and len(row) <= last:
             wrong = f"the line ends before column '{form.names[last]}'"
         if wrong:
-            wrong = f'{path}:{lines[k]}: {wrong}'
+            bad = BadLine(lines[k], wrong)
             if left_out is None:
-                raise InputError(wrong + _PARTIAL)
-            left_out.append(wrong)
+                raise InputError(bad.error(path) + _PARTIAL)
+            left_out.append(bad)
         elif not blank:
             kept.append(k)
     return [lines[k] for k in kept], [rows[k][:last + 1] for k in kept]
 
 
 def _floats(path: Path, lines: Sequence[int], cells: Sequence[str], form: Form, place: int,
-            good: npt.NDArray[np.bool_] | None, left_out: list[str] | None) -> FloatArray:
+            good: npt.NDArray[np.bool_] | None, left_out: list[BadLine] | None) -> FloatArray:
     """Return the cells of a column as numbers."""
-    # A bad cell raises InputError; with `good`, its line is marked as bad, and one error appended.
+    # A bad cell raises InputError; with `good`, its line is marked as bad, and appended once.
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
         # As in `plain_number`.
@@ -629,12 +629,12 @@ def _floats(path: Path, lines: Sequence[int], cells: Sequence[str], form: Form, 
                 cell = _with_point(cell)
             mark = ': the decimal mark is a comma (--decimal)' if form.comma else (
                 _MARK * (cell.count(',') == 1))
-            wrong = (f"{path}:{lines[k]}: column '{form.names[place]}' holds '{shown(cell)}', not "
-                     f'a number{mark}')
+            bad = BadLine(lines[k], (
+                f"column '{form.names[place]}' holds '{shown(cell)}', not a number{mark}"))
             if good is None or left_out is None:
-                raise InputError(wrong + _PARTIAL * (not mark))
+                raise InputError(bad.error(path) + _PARTIAL * (not mark))
             if good[k]:
-                left_out.append(wrong)
+                left_out.append(bad)
             good[k] = False
         found.append(value)
     return np.array(found, dtype=np.float64)

@@ -23,7 +23,7 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_cells import (
-    AMPERE_WORDS, CHANNEL, clock_times, factor_of, FileColumn, has_day, in_si, is_clock,
+    AMPERE_WORDS, BadLine, CHANNEL, clock_times, factor_of, FileColumn, has_day, in_si, is_clock,
     is_missing, is_number, is_value, lower_rows, MOST_VOLTS, number_of, OTHER_WORDS, PULSE_WORDS,
     SCALES, SHARE_WORDS, shown, stamps_of, TIME_WORDS, unit_of, unwrapped, VOLT_WORDS, WORDS)
 from ou_monitor.recordings.importers.csv_form import (
@@ -122,16 +122,17 @@ class _Table(NamedTuple):
 def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = False,
              ) -> Recording:
     """Read the samples of a supply, unsorted, with NaN kept (partial: leave out bad lines)."""
-    left_out: list[str] | None = [] if partial else None
+    left_out: list[BadLine] | None = [] if partial else None
     table = _table(path, columns or CsvColumns(), left_out=left_out)
     said = [*table.notes]
     if left_out:
         if len(left_out) > WILD * table.t.size:
-            raise InputError(f'{left_out[0]} ({len(left_out)} such lines, too many to leave out)')
-        first = printable(left_out[0].removeprefix(str(path)).lstrip(': '))
+            raise InputError(f'{left_out[0].error(path)} ({len(left_out)} such lines, too many to '
+                             'leave out)')
+        line, why = left_out[0]
         said.append(Note(
             f'{counted(len(left_out), "bad line")} left out, such as '
-            f'{"line " * first[0].isdigit()}{first}.', Defect.DAMAGED_FILE))
+            f'{"" if line is None else f"line {line}: "}{printable(why)}.', Defect.DAMAGED_FILE))
     t, (column, volts) = table.t, table.found[logs.VOLTAGE]
     nothing = np.full(t.shape, np.nan)
     name = printable(path.name)
@@ -235,7 +236,7 @@ def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
 
 
 def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (),
-           needed: str = ' (--voltage-column)', left_out: list[str] | None = None) -> _Table:
+           needed: str = ' (--voltage-column)', left_out: list[BadLine] | None = None) -> _Table:
     """Read time, supply and named columns (needed: hint if no voltage is found; '': optional)."""
     form = form_of(path, wanted)
     time = _time_of(path, form, wanted)
@@ -574,7 +575,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: FileColumn, nee
 
 
 def _read(path: Path, form: Form, time: FileColumn, places: list[int],
-          left_out: list[str] | None = None) -> tuple[FloatArray, list[FloatArray]]:
+          left_out: list[BadLine] | None = None) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written (dates and clocks in s), and columns."""
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:

@@ -10,6 +10,7 @@ import codecs
 from collections.abc import Callable
 from contextlib import redirect_stderr, suppress
 from dataclasses import replace
+import enum
 from importlib import import_module
 from pathlib import Path
 import shlex
@@ -84,8 +85,15 @@ def format_of(head: bytes) -> Format | None:
     return next((one for one in FORMATS if head and one.fits(head)), None)
 
 
-# Words for text of any other format.
-TEXT = 'it is text; if it is a table of time and voltage, name it NAME.csv'
+
+class Foreign(enum.Enum):
+    """What is known of a file that is not MCAP."""
+
+    NAMED = enum.auto()
+    TEXT = enum.auto()
+    UNKNOWN = enum.auto()
+
+
 # First bytes -> what it is, and what to do.
 _FOREIGN = {
     b'SQLite format 3': "an SQLite rosbag2 (.db3): convert it with 'ros2 bag convert' to the "
@@ -106,18 +114,20 @@ _FOREIGN = {
     b'<html': 'a web page, not the file behind it'}
 
 
-def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
-    """Return the likely kind of a file that is not MCAP, and what to do with it."""
+def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> tuple[Foreign, str]:
+    """Return the likely kind of a file that is not MCAP, and in words what to do with it."""
     for begin, words in _FOREIGN.items():
         if head.lstrip(b'\xef\xbb\xbf \t\r\n').startswith(begin):
-            return f'it is {words}'
+            return Foreign.NAMED, f'it is {words}'
     log = format_of(head)
     if log is not None and log.name not in (BAG, CSV):
         command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
-        return f'it is a log, {log.words}, not a bag: convert it first, with {command}'
+        return Foreign.NAMED, (f'it is a log, {log.words}, not a bag: convert it first, with '
+                               f'{command}')
     if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
-        return TEXT
-    return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')
+        return Foreign.TEXT, ('it is text; if it is a table of time and voltage, name it '
+                              'NAME.csv')
+    return Foreign.UNKNOWN, 'its first bytes are ' + (head[:8].hex(' ') or 'missing')
 
 
 def detect(path: Path) -> Format:
