@@ -45,7 +45,7 @@ def test_the_page_tells_what_stands_out(odd):
     text = page_text(odd)
     found = finding_words(odd)
     assert len(found) >= 3
-    for sentence in (*found, fleet_document(odd).headline, '/f/bad: is no <bag>',
+    for sentence in (*found, fleet_document(odd).headline, '/f/bad is no <bag>',
                      '/f/copy is /f/uav1/1',
                      'Vehicles: by <hand> & eye.', "ou-monitor fleet 'a <b>'"):
         assert ' '.join(sentence.split()) in text
