@@ -276,9 +276,13 @@ def cause_rows(causes: Sequence[Cause], load: str = 'throttle') -> list[CauseRow
         group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
         _chance(group[0]),
         tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
-        replace(group[0].explanation, estimates=tuple(
-            one for cause in group for one in cause.explanation.estimates)).text)
-        for group in groups.values()]
+        _together(group).text) for group in groups.values()]
+
+
+def _together(group: Sequence[Cause]) -> Explanation:
+    """Return the explanation of the first cause, with the estimates of all."""
+    return replace(group[0].explanation, estimates=tuple(
+        one for cause in group for one in cause.explanation.estimates))
 
 
 def gain_text(gain: float, gain_se: float) -> str:

@@ -85,7 +85,6 @@ def format_of(head: bytes) -> Format | None:
     return next((one for one in FORMATS if head and one.fits(head)), None)
 
 
-
 class Foreign(enum.Enum):
     """What is known of a file that is not MCAP."""
 
