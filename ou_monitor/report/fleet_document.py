@@ -24,8 +24,6 @@ _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
 _UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s'}
 # Maximum number of drifts drawn, the most likely ones.
 _DRAWN = 8
-# Maximum trends listed, the most likely ones.
-_MOST = 30
 # Maximum recordings in the table of lowest voltages; maximum rows or sentences on a terminal.
 _WORST, _SHOWN = 12, 10
 # Maximum recordings listed on the page; JSON and the Parquet table have all.
@@ -38,8 +36,8 @@ TITLE = 'Supply noise of a fleet'
 # Heads of the tables of packs and of vehicles.
 PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\nper cell, mOhm',
               'per flight\n[95 %]', 'sag\nper cell, mV', 'per flight\n[95 %]')
-VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sigma, V/sqrt(s)', 'per flight',
-                 'alpha, 1/s', 'per flight')
+VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sigma, V/sqrt(s)',
+                 'per flight\n[95 %]', 'alpha, 1/s', 'per flight\n[95 %]')
 # Maximum characters of a vehicle's name in a table.
 _NAME = 30
 # Heads of the table of recordings.
@@ -71,8 +69,10 @@ def fleet_document(fleet: Fleet) -> Document:
         Section('Vehicles', [
             vehicles,
             Text('Lowest voltage and total dips of all flights.' + (
-                ' sigma and alpha: medians as measured; "per flight": drift at the common '
-                'throttle. A star marks what stands out.' if {*VEHICLE_HEADS[4:]}.intersection(
+                ' sigma and alpha: medians as measured. "Per flight": slope of a straight line '
+                'fitted to the logarithms at the common throttle, weighted by the errors. A star '
+                'marks what stands out: of a slope, by a t test on the scatter about the line, '
+                'Holm-adjusted.' if {*VEHICLE_HEADS[4:]}.intersection(
                     vehicles.heads) else ''), legend=True)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
@@ -342,7 +342,7 @@ def pack_table(fleet: Fleet) -> Table:
                          _cells_of(mine)])
             for name in OF_PACK:
                 rows[-1] += [_pack_value(mine, name, _star(judged, name, vehicle)),
-                             _slope(judged, name, vehicle, interval=True)]
+                             _slope(judged, name, vehicle)]
     return Table.of_known(PACK_HEADS, rows, left=[0, 2], most=2 * _SHOWN)
 
 
@@ -405,11 +405,11 @@ def _median(judged: Judgement, name: str, vehicle: str) -> str:
     return number(float(np.median(values.measured[mine]))) + _star(judged, name, vehicle)
 
 
-def _slope(judged: Judgement, name: str, vehicle: str, *, interval: bool = False) -> str:
+def _slope(judged: Judgement, name: str, vehicle: str) -> str:
     for trend in judged.trends:
         if (trend.quantity, trend.vehicle) == (name, vehicle):
-            return change(trend.slope) + '*' * (trend.p_family <= DRIFT_RATE) + (
-                f'\n[{change(trend.low)}, {change(trend.high)}]' if interval else '')
+            return (f'{change(trend.slope)}{"*" * (trend.p_family <= DRIFT_RATE)}\n'
+                    f'[{change(trend.low)}, {change(trend.high)}]')
     return UNKNOWN
 
 
@@ -563,23 +563,12 @@ def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
 
 
 def _drift(fleet: Fleet) -> list[Part]:
+    """Return plots of the drifts that are certain."""
     judged = fleet.judgement
-    if not judged.trends:
-        return [Text('No vehicle has enough flights for a test.')]
-    parts = Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), (
+    return [*Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), (
         f'{change(t.slope)} per flight; fleet-wide p {chance(t.p_family)}. Values'
         f'{_at_throttle(judged.values[t.quantity]) or " as measured"}, with 95 % intervals.'))
-        for t in judged.drifting[:_DRAWN]])
-    rows = [[t.vehicle, t.quantity, str(t.flights), change(t.slope) + '\n'
-             + f'[{change(t.low)}, {change(t.high)}]',
-             chance(t.p_value), chance(t.p_family),
-             'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in judged.trends[:_MOST]]
-    more = len(judged.trends) - len(rows)
-    return [*parts, Table(['vehicle', 'quantity', 'flights', 'change per flight\n[95 %]', 'p',
-                           'fleet-wide p', 'significant'], rows, left=[0, 1]), Text(
-        'Straight lines fitted to the logarithms, weighted by the errors; p: t test by the '
-        'scatter about the line; fleet-wide p: Holm-adjusted.'
-        + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
+        for t in judged.drifting[:_DRAWN]])]
 
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:
