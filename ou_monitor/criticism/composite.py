@@ -79,7 +79,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
         z, density, cost = gaussian.z, gaussian.density, cost + gaussian.cost
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
-        power, white = np.ones(samples.n), np.ones(samples.n)
+        power, white, bias = np.ones(samples.n), np.ones(samples.n), np.zeros(samples.n)
         for k, law in enumerate(laws):
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power,
                            power=1.0 if events is None else events.power)
@@ -97,10 +97,12 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
             moved += 0.0 if fit.offset is None else fit.offset
             power *= 1.0 if fit.power is None else np.clip(fit.power, *_POWERS)
             white *= 1.0 if fit.white is None else np.clip(fit.white, *_POWERS)
-        found = Events(push, error, power, white)
+            bias += 0.0 if fit.bias is None else fit.bias
+        found = Events(push, error, power, white, bias)
         if _converged(events, offset, found, moved, gaussian) or turn == last:
             break
-        if push.any() or error.any() or events is not None or (power != 1.0).any():
+        if events is not None or any(
+                x.any() for x in (push, error, power - 1.0, white - 1.0)):
             events = found
         offset = moved if moved.any() else None
         structural = list(gaussian.terms)
@@ -117,11 +119,12 @@ def _kinds(terms: Sequence[Term | type[Term]]) -> list[str]:
 
 def _converged(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
                gaussian: GaussianFit) -> bool:
-    before = events or Events(np.zeros(1), np.zeros(1), np.ones(1), np.ones(1))
+    before = events or Events(np.zeros(1), np.zeros(1), np.ones(1), np.ones(1), np.zeros(1))
     if ((found.push > 0.0) != (before.push > 0.0)).any() or (
             (found.error > 0.0) != (before.error > 0.0)).any():
         return False
-    if float(np.mean(np.abs(np.log(found.power / before.power)))) > _ALIKE:
+    if any(float(np.mean(np.abs(np.log(now / then)))) > _ALIKE for now, then in (
+            (found.power, before.power), (found.white, before.white))):
         return False
     change = moved - (0.0 if offset is None else offset)
     return float(np.mean(change**2)) < 0.01 * float(np.median(gaussian.variance))

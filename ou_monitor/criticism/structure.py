@@ -42,16 +42,18 @@ _KEPT = 8  # Number of models whose factors are kept: a fit moves one parameter 
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """Variance added by events, and a factor on the noise."""
+    """Variance added by events, factors on the noise, and errors of readings."""
 
-    push: FloatArray  # Added to the state, V^2; shape (n,)
-    error: FloatArray  # Added to the measurement, V^2; shape (n,)
+    push: FloatArray  # Variance added to the state, V^2; shape (n,)
+    error: FloatArray  # Variance added to the measurement, V^2; shape (n,)
     power: FloatArray  # Factor on the state noise of the `ou`; shape (n,)
     white: FloatArray  # Factor on the white noise; shape (n,)
+    bias: FloatArray  # Mean error of the reading, V; shape (n,)
 
     def part(self, part: slice) -> Events:
         """Return the events of some samples."""
-        return Events(self.push[part], self.error[part], self.power[part], self.white[part])
+        return Events(self.push[part], self.error[part], self.power[part], self.white[part],
+                      self.bias[part])
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +101,10 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     run = _filter(samples, terms, events)
     beta = [value for term in terms for value in coefficients(term)]
     mean = design_of(samples, terms, run.segment)[:, 1:] @ np.array(beta)
-    e = run.kalman.innovations(samples.voltage - mean)
     # Exclude the event at each sample, because a law predicts it.  Only the fit of the Gaussian
     # part, which has no laws, includes the event.
-    variance = run.full if inside else run.plain
+    bias, variance = (0.0, run.full) if inside else (run.bias, run.plain)
+    e = run.kalman.innovations(samples.voltage - bias - mean) + bias
     return GaussianFit(tuple(terms), tuple({} for _ in terms), mean, e, variance,
                        _log_density(e, variance), run.segment.phi, run.cost)
 
@@ -140,6 +142,7 @@ class _Run:
     kalman: Filter
     plain: FloatArray  # Predictive variances without the event at each sample, V^2; shape (n,)
     full: FloatArray  # Predictive variances with that event, V^2; shape (n,)
+    bias: FloatArray | float  # Mean errors of the readings, V; shape (n,)
     cost: float  # Processor time, s
 
 
@@ -147,15 +150,16 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _
     states = 1 + sum(term.STATES for term in terms if term.ROLE is Role.BLOCK)
     if events is not None and states >= _MANY and not events.error.any():
         # Extra variance hardly changes the gains if there are several states, so the filter has
-        # constant gains, which saves most of the time.
+        # constant gains, which saves most of the time, and takes the readings as they are.
         s, space, _ = state_space(samples, terms, None)
         run = Filter(space, samples.n)
         return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * s.added
                     + events.push + (events.white - 1.0) * white_noise(samples, terms, s),
-                    _filter_cost(space, samples.n))
+                    0.0, _filter_cost(space, samples.n))
     s, space, own = state_space(samples, terms, events)
     run = Filter(space, samples.n)
-    return _Run(s, run, run.variance - own, run.variance, _filter_cost(space, samples.n))
+    return _Run(s, run, run.variance - own, run.variance, 0.0 if events is None else events.bias,
+                _filter_cost(space, samples.n))
 
 
 def _filter_cost(space: StateSpace, n: int) -> float:

@@ -205,14 +205,14 @@ def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_
     fit = SimpleNamespace(variance=np.full(3, 4.0))
 
     def same(push, error, before, power=1.0, moved=0.0, offset=None):
-        found = Events(push, error, np.full(3, power), np.ones(3))
+        found = Events(push, error, np.full(3, power), np.ones(3), zero)
         return _converged(before, offset, found, np.full(3, moved), fit)
-    none = Events(zero, zero, np.ones(3), np.ones(3))
+    none = Events(zero, zero, np.ones(3), np.ones(3), zero)
     assert same(zero, zero, None) and same(zero, zero, none)
     for push, error in ((one, zero), (zero, one)):
         assert not same(push, error, None) and not same(push, error, none)
-        assert same(9.0 * push, 9.0 * error, Events(push, error, np.ones(3), np.ones(3)))
-        assert not same(zero, zero, Events(push, error, np.ones(3), np.ones(3)))
+        assert same(9.0 * push, 9.0 * error, Events(push, error, np.ones(3), np.ones(3), zero))
+        assert not same(zero, zero, Events(push, error, np.ones(3), np.ones(3), zero))
     assert same(zero, zero, None, moved=0.199) and not same(zero, zero, None, moved=0.201)
     assert same(zero, zero, None, moved=5.1, offset=np.full(3, 5.0))
     assert not same(zero, zero, None, power=4.0)
@@ -237,7 +237,7 @@ def test_events_add_to_the_joint_normal_law():
     push[9], error[20], power[30:33] = 0.7, 0.9, 3.0
     std, white = 0.2, np.where(np.arange(n) // 4 == 4, 5.0, 1.0)
     found = evaluate(Samples(t, v, None), [OU(alpha, sigma, u0), MeasurementNoise(std)],
-                     Events(push, error, power, white))
+                     Events(push, error, power, white, np.zeros(n)))
     keep = np.append(0.0, np.exp(-alpha * np.diff(t)))
     added = power * sigma**2 / (2.0 * alpha) * (1.0 - keep**2) + push
     spread = np.zeros(n)

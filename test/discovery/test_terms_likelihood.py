@@ -163,7 +163,8 @@ def law_fitted(name, samples, terms):
             break
         none = np.zeros(samples.n)
         events = Events(none if fit.push is None else fit.push,
-                        none if fit.error is None else fit.error, none + 1.0, none + 1.0)
+                        none if fit.error is None else fit.error, none + 1.0, none + 1.0,
+                        none)
     return fit, evaluate(samples, terms[:-1]).z, state_of(samples, gaussian)
 
 
@@ -256,7 +257,8 @@ def test_bad_samples_are_found_and_not_their_neighbours(run):
         gaussian = evaluate(samples, (ou,), events)
         fit = catalogue()['glitches'].fit_runs(
             view_of(samples, gaussian, gaussian.z, slice(0, samples.n)))
-        events = Events(np.zeros(LENGTH), fit.error, np.ones(LENGTH), np.ones(LENGTH))
+        events = Events(np.zeros(LENGTH), fit.error, np.ones(LENGTH), np.ones(LENGTH),
+                        np.zeros(LENGTH))
     found = fit.error > 0.0
     beside = ~bad & (np.roll(bad, 1) | np.roll(bad, -1))
     assert found[bad].all()

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from ou_monitor.model.hidden_chain import forward
 from ou_monitor.model.terms.term import (
-    climb, curvature_se, Effect, LawFit, log_normal, mixture_cdf, normal_scores, parameter, Role,
-    Segment, Stage, Term, View)
+    climb, curvature_se, Effect, LawFit, LOG_2PI, log_normal, mixture_cdf, normal_scores,
+    parameter, Role, Segment, Stage, Term, View)
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
@@ -130,19 +130,36 @@ class LopsidedNoise(Term):
         centre = np.bincount(cells, z[view.train], edges.size - 1)[some] / count
 
         def value(x: FloatArray) -> float:
-            return float(count @ _lopsided_scores(centre, white, *x)[1])
+            return float(count @ _lopsided_law(centre, white, *x)[0])
 
         skewed = float(np.sign(np.mean(z[view.train] ** 3)))
         x, most = climb(value, [0.1 * skewed, -0.1, 0.0], 0.2)
         even = climb(lambda x: value(np.array([0.0, *x])), x[1:], 0.2)[1]
         x = np.clip(x, *_RANGE)
-        each, gain = _lopsided_scores(z, white, *x)
-        scores = normal_scores(_REST[1] @ ndtr(each))
+        gain, below = _lopsided_law(z, white, *x)
+        scores = normal_scores(below)
         se = curvature_se(value, x)
         tail = math.exp(x[1])
+        factor, bias = _as_normal(z, white, x)
         fit = LawFit(cls(float(x[0]), tail), {'skew': float(se[0]), 'tail': tail * float(se[1])},
-                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3)
+                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3, white=factor,
+                     bias=bias * np.sqrt(view.variance))
         return fit, most - even > 0.5 * math.log(z[view.train].size)
+
+
+def _as_normal(z: FloatArray, white: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return factors on the white noise, and errors of the readings in units of the scores."""
+    # A reading moves the mean of the state by the state's variance times the slope of the log
+    # density (Masreliez, IEEE Trans. Autom. Control 20 (1975) 107).  A normal law does the same
+    # with these variances and errors.  The variance is the score over the slope, as for a normal
+    # law of unknown variance (ones are added because their zeros differ), and up to a factor such
+    # that a fit of normal laws with these variances finds the size of the noise.
+    low, high = (_lopsided_law(z + by, white, *x)[0] for by in (-_NUDGE, _NUDGE))
+    slope = z - (high - low) / (2.0 * _NUDGE)
+    square = z * z
+    whole = (1.0 + square) / np.maximum(1.0 + z * slope, _NUDGE)
+    whole = np.maximum(whole * float(np.mean(square / whole) / np.mean(square)), 1.0 - white)
+    return (whole - 1.0) / white + 1.0, z - slope * whole
 
 
 def _of_readings(view: View) -> bool:
@@ -156,6 +173,7 @@ def _of_readings(view: View) -> bool:
     return after < float(np.median(phi)) * (0.5 - float(np.median(gain)))
 
 
+_NUDGE = 1e-2  # Step of numerical slopes of a log density
 _CELLS = 400  # Number of bins of scores in a fit
 # Range of skew, ln tail and ln scale.
 _RANGE = np.array([[-3.0, -1.5, -math.inf], [3.0, 1.5, math.inf]])
@@ -176,22 +194,42 @@ def _moments(skew: float, tail: float) -> tuple[float, float]:
     return mean, math.sqrt(float(weights @ (values - mean) ** 2))
 
 
-def _lopsided_scores(z: FloatArray, white: float, skew: float, log_tail: float, log_scale: float
-                     ) -> tuple[FloatArray, FloatArray]:
-    """Return normal scores of the law by point of the rest, and gains in log density, nats."""
+def _lopsided_law(z: FloatArray, white: float, skew: float, log_tail: float, log_scale: float
+                  ) -> tuple[FloatArray, FloatArray]:
+    """Return gains in log density over N(0, 1), nats, and probabilities of lower scores."""
     # A score is the sum of white noise, a share `white` of its variance, and a normal rest.
     skew, log_tail, log_scale = np.clip((skew, log_tail, log_scale), *_RANGE).tolist()
     tail = math.exp(log_tail)
     mean, std = _moments(skew, tail)
     unit = std * math.exp(-log_scale) / math.sqrt(white)
-    y = mean + unit * (z - math.sqrt(1.0 - white) * _REST[0][:, None])
-    wide = tail * np.arcsinh(y) - skew
-    scores = np.sinh(wide)
-    density = _REST[1] @ (np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(1.0, y))
-    return scores, np.log((density + _TINY) * tail * unit) + 0.5 * z * z
+
+    def normal(y: FloatArray) -> FloatArray:
+        """Return the normal draw, less the skew, from which white noise is made."""
+        return np.asarray(tail * np.arcsinh(mean + unit * y) - skew)
+
+    share = np.diff(ndtr(np.sinh(normal(_EDGES))))
+    share = np.fft.irfft(np.fft.rfft(share) * np.exp(-0.5 * (1.0 - white) * _OMEGA ** 2),
+                         share.size)
+    density = np.interp(z, _EDGES[:-1] + 0.5 * _CELL, share / _CELL, 0.0, 0.0)
+    below = np.interp(z, _EDGES[1:], np.cumsum(share))
+    far = np.flatnonzero(density < _LEAST_DENSITY)
+    if far.size:
+        y = z[far] - math.sqrt(1.0 - white) * _REST[0][:, None]
+        wide = normal(y)
+        scores = np.sinh(wide)
+        below[far] = _REST[1] @ ndtr(scores)
+        density[far] = _REST[1] @ (np.exp(-0.5 * scores * scores) * np.cosh(wide) / np.hypot(
+            1.0, mean + unit * y)) * tail * unit / math.sqrt(2.0 * math.pi)
+    return np.log(density + _TINY) + 0.5 * (z * z + LOG_2PI), below
 
 
-# Points and weights of the normal rest; minimum density.
+# Cells of scores in which the density is computed by a Fourier transform, and their frequencies.
+_CELL = 0.0125
+_EDGES = _CELL * np.arange(-1000.0, 1001.0)
+_OMEGA = 2.0 * np.pi * np.fft.rfftfreq(_EDGES.size - 1, _CELL)
+# Density below which rounding errors of that transform matter, and a quadrature over the normal
+# rest takes its place: its points and weights.
+_LEAST_DENSITY = 1e-9
 _REST = tuple(part / scale for part, scale in zip(
     np.polynomial.hermite_e.hermegauss(12), (1.0, math.sqrt(2.0 * math.pi)), strict=True))
 _TINY = 1e-300

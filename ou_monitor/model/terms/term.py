@@ -511,6 +511,7 @@ class LawFit:
     # mean precision; shape (n,).
     power: FloatArray | None = None
     white: FloatArray | None = None  # Like `power`, for the white noise; shape (n,)
+    bias: FloatArray | None = None  # Mean error of the reading, given its score, V; shape (n,)
     # Voltage that the law adds to the level, V; subtracted before the Gaussian fit; shape (n,).
     offset: FloatArray | None = None
 
