@@ -204,8 +204,10 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
     info = np.array([means[b].T @ means[b] + 0.5 * spreads[b].T @ spreads[b] for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
-    # A law estimates its offset from later samples too, so the errors are computed without it.
-    plain = base if model.offset is None else evaluate(samples, terms, events)
+    # A law estimates its offset from later samples too, so the errors are computed without it; its
+    # errors of readings are those of the samples before.
+    biased = events is not None and bool(events.bias.any())
+    plain = evaluate(samples, terms, events) if biased or model.offset is not None else base
     error = plain.innovation.copy()
     for b, own, mean in zip(blocks, info, gram, strict=True):
         others, rest = info.sum(axis=0) - own, gram.sum(axis=0) - mean
@@ -223,6 +225,7 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
             continue
         density[b] += there.density[b] - base.density[b]
         if model.offset is None:
+            there = evaluate(data, there.terms, events) if biased else there
             error[b] = there.innovation[b]
     laws = model.free - sum(len(term.free()) + len(term.LINEAR) for term in terms) - 1
     density -= (laws + model.search) / samples.n
