@@ -386,7 +386,8 @@ def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: 
               for k, name in enumerate(names)]
     # Else the unit of a channel in a line above.
     begin = int(rows[at - 1][1:len(names) + 1] != names)
-    stated = [unit or _unit_above(names, k, begin, rows[:first]) for k, unit in enumerate(stated)]
+    above = _units_above(names, begin, rows[:first])
+    stated = [unit or other for unit, other in zip(stated, above)]
     # Else the unit behind the first number of the column.
     for k, unit in enumerate(stated):
         cell = next((row[k] for row in rows[first:] if k < len(row) and is_number(row[k])), '0')
@@ -394,28 +395,33 @@ def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: 
     return tuple(stated)
 
 
-def _unit_above(names: list[str], k: int, begin: int, above: list[list[str]]) -> str:
-    """Return the unit of volts or amperes of a column in the lines above; '' if none states it."""
+def _units_above(names: list[str], begin: int, above: list[list[str]]) -> list[str]:
+    """Return the unit of volts or amperes of each column in the lines above; '' if none."""
     # The unit is at the end of the channel's own line ('CH2,DC,50mV,A'), or in a line of units
     # ('Vertical Units,V,CH2:A'), below the channel's name or in the order of the columns.
-    if k < begin:
-        return ''
-    place = k + 1 - begin
-    label = next((p for row in above for p, cell in enumerate(row) if p and cell == names[k]),
-                 place)
-    for row in filter(None, map(_trimmed, above)):
-        cells = [row[-1]] if k and len(row) > 1 and row[0] == names[k] else []
-        if 'unit' in row[0].lower():
-            cells = [*row[label:label + 1], *row[place:place + 1]]
-            # If blank cells separate the units, count only the units.
-            units = [cell for cell in row[1:] if cell]
-            if len(units) == len(names) - begin < len(row) - 1:
-                cells = [units[place - 1]]
-        for cell in cells:
-            word = cell.split(':')[-1].strip().lower()
-            if word in VOLT_WORDS or word in AMPERE_WORDS:
-                return word
-    return ''
+    rows = [row for row in map(_trimmed, above) if row]
+    labels: dict[str, int] = {}
+    for row in rows:
+        for p, cell in enumerate(row[1:], 1):
+            labels.setdefault(cell, p)
+    found = [''] * len(names)
+    for row in rows:
+        of_units = 'unit' in row[0].lower()
+        # If blank cells separate the units, count only the units.
+        units = [cell for cell in row[1:] if cell]
+        counted = len(units) == len(names) - begin < len(row) - 1
+        for k in range(begin, len(names)):
+            place = k + 1 - begin
+            if found[k] or not (of_units or row[0] == names[k]):
+                continue
+            cells = [row[-1]] if k and len(row) > 1 else []
+            if of_units:
+                label = labels.get(names[k], place)
+                cells = [units[place - 1]] if counted else [
+                    *row[label:label + 1], *row[place:place + 1]]
+            found[k] = next((word for cell in cells if (
+                word := cell.split(':')[-1].strip().lower()) in {*VOLT_WORDS, *AMPERE_WORDS}), '')
+    return found
 
 
 def has_unit_beside(names: Sequence[str], place: int) -> bool:
