@@ -119,7 +119,7 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     design = design_of(samples, (*kept, *more), run.segment)
-    voltage = samples.voltage if offset is None else samples.voltage - offset
+    voltage = samples.voltage - run.bias - (0.0 if offset is None else offset)
     owners = [term for term in _means(terms) for _ in term.LINEAR]
     fixed = [] if own else [k for k, term in enumerate(owners, 1) if not term.MEASURED]
     if fixed:
@@ -389,9 +389,12 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
     if not (variance > 0.0).all():
         raise ArithmeticError('variances are not positive')
     weight = 1.0 / np.sqrt(variance)
-    through = run.kalman.innovations(design) * weight[:, None]
-    beta, _ = solved(through.T @ through)
-    e = (through[:, 0] - through[:, 1:] @ beta) / weight
+    # The mean is that of the readings less their errors, the sizes of the noise are not.
+    through = run.kalman.innovations(np.column_stack((
+        design[:, 0] - run.bias, design))) * weight[:, None]
+    cleaned = np.delete(through, 1, axis=1)
+    beta, _ = solved(cleaned.T @ cleaned)
+    e = (through[:, 1] - through[:, 2:] @ beta) / weight
     return GaussianFit(with_mean(terms, beta), (), design[:, 1:] @ beta, e, variance,
                        _log_density(e, variance), run.segment.phi,
                        run.cost + 1e-8 * samples.n * beta.size)
