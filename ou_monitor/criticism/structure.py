@@ -389,12 +389,14 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
     if not (variance > 0.0).all():
         raise ArithmeticError('variances are not positive')
     weight = 1.0 / np.sqrt(variance)
-    # The mean is that of the readings less their errors, the sizes of the noise are not.
-    through = run.kalman.innovations(np.column_stack((
-        design[:, 0] - run.bias, design))) * weight[:, None]
-    cleaned = np.delete(through, 1, axis=1)
-    beta, _ = solved(cleaned.T @ cleaned)
-    e = (through[:, 1] - through[:, 2:] @ beta) / weight
+    through = run.kalman.innovations(design) * weight[:, None]
+    gram = through.T @ through
+    if np.any(run.bias):
+        # The mean is that of the readings less their errors; the sizes of the noise are not.
+        errors = run.kalman.innovations(np.asarray(run.bias)) * weight
+        gram[1:, 0] -= through[:, 1:].T @ errors
+    beta, _ = solved(gram)
+    e = (through[:, 0] - through[:, 1:] @ beta) / weight
     return GaussianFit(with_mean(terms, beta), (), design[:, 1:] @ beta, e, variance,
                        _log_density(e, variance), run.segment.phi,
                        run.cost + 1e-8 * samples.n * beta.size)

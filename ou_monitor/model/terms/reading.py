@@ -157,7 +157,7 @@ def _as_normal(z: FloatArray, white: float, x: FloatArray) -> tuple[FloatArray, 
     low, high = (_lopsided_law(z + by, white, *x)[0] for by in (-_NUDGE, _NUDGE))
     slope = z - (high - low) / (2.0 * _NUDGE)
     square = z * z
-    whole = (1.0 + square) / np.maximum(1.0 + z * slope, _NUDGE)
+    whole = (1.0 + square) / np.maximum(1.0 + z * slope, _FLAT)
     whole = np.maximum(whole * float(np.mean(square / whole) / np.mean(square)), 1.0 - white)
     return (whole - 1.0) / white + 1.0, z - slope * whole
 
@@ -173,7 +173,8 @@ def _of_readings(view: View) -> bool:
     return after < float(np.median(phi)) * (0.5 - float(np.median(gain)))
 
 
-_NUDGE = 1e-2  # Step of numerical slopes of a log density
+# Step of numerical slopes of a log density, and minimum of a divisor.
+_NUDGE, _FLAT = 1e-2, 1e-2
 _CELLS = 400  # Number of bins of scores in a fit
 # Range of skew, ln tail and ln scale.
 _RANGE = np.array([[-3.0, -1.5, -math.inf], [3.0, 1.5, math.inf]])
